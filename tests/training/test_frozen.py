@@ -1,6 +1,7 @@
 """A frozen encoder: what it saw is what inference sees, and nothing ever changes it."""
 
 import dataclasses
+import functools
 import threading
 import time
 
@@ -268,7 +269,7 @@ def test_pictures_in_the_place_of_features_are_an_error(source, dataset, tmp_pat
 def test_every_frame_has_its_own_features(source, dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(frozen, "PART", 30)  # of batches that its end cuts
     settings, found = source
-    see = frozen._make_see(found, settings)
+    see = functools.partial(frozen._see_program(settings), found.params)
     pictures = np.asarray(dataset.observation.images["camera"])
     wanted = np.concatenate([see(pictures[first : first + 16]) for first in range(0, 80, 16)])
     np.testing.assert_allclose(features(source, dataset, tmp_path), wanted, atol=1e-5)

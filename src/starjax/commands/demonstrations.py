@@ -111,6 +111,19 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> DemosWork:
     return DemosWork(root, collect, prepare)
 
 
+def size(config: config_lib.RunConfig, task: Any) -> tuple[int, int]:
+    """Returns the number of demonstrations that are collected, and the frames to have room for.
+
+    Both are 0 for a dataset that is given.
+    """
+    from starjax.data import demos
+
+    if config.demos.from_:
+        return 0, 0
+    count = config.demos.per_trocar * len(task.is_seen[: config.demos.seen_trocars])
+    return count, demos.rows(count, config.demos.max_steps)
+
+
 def randomised(config: config_lib.RunConfig, env: Any) -> tuple[Any, dict[str, float]]:
     """Returns the environment for recording demonstrations, and the maximum levels of its
     disturbances as datasets hold them.
@@ -201,10 +214,13 @@ def load(
     complete(config, root, collect, share)
     draws = env if config.policy.observation == "image" else None
     report = messages.indented
-    if encoder is None:
+    if draws and encoder is None:
         redraws = randomise.redraws(config.train)
         return loading.load(root, verify=False, env=draws, sources=redraws, report=report).dataset
-    loaded = loading.load(root, verify=False, images=False, report=report)
+    _, rows = size(config, env.task)
+    loaded = loading.load(root, verify=False, images=encoder is None, rows=rows, report=report)
+    if encoder is None:
+        return loaded.dataset
     return with_features(config, draws, root, loaded, encoder)
 
 

@@ -43,7 +43,7 @@ def about_served(config: config_lib.RunConfig, name: str, seed: int) -> str:
     plans = f"{policy.horizon} commands, {policy.execute} of them executed"
     lines = [
         f"starjax {starjax.__version__}: policy served at {name}",
-        *_setting(config)[:2],
+        *_setting(config)[:3],
         f"  observation     {policy.observation}; plans of {plans}",
         f"{_evaluation(config)}, seed {seed}",
     ]
@@ -54,11 +54,15 @@ def _setting(config: config_lib.RunConfig) -> list[str]:
     """Returns lines with devices, scene, observation and ablations."""
     import jax
 
+    from starjax.runtime import stored
+
     devices, scene = jax.devices(), config.scene
+    programs = "found in" if stored.are_cached() else "compiled now, for minutes, and kept in"
     robots = ", ".join(f"{arm} with {tool}" for arm, tool in zip(scene.arm, scene.tool))
     parts = [_task(config).text.title, robots, ", ".join(scene.camera)]
     return [
         f"  device          {len(devices)} x {devices[0].device_kind}, {xla.cores()} CPU cores",
+        f"  programs        {programs} {xla.compilation_cache()}",
         f"  scene           {'; '.join(filter(None, parts))}",
         *_seeing(config),
         *(f"  ablation        {what}" for what in _ablations(config.method, config.policy)),

@@ -24,7 +24,7 @@ class Precompiled(NamedTuple):
 def begin(
     config: config_lib.RunConfig, name: str, stages: Sequence[str], env: Any, encoder: Any
 ) -> Precompiled:
-    """Begins to compile the training step of a method, and then its trials and inference.
+    """Begins to compile the features and the training of a method, then its trials and inference.
 
     Args:
       config: settings of the run.
@@ -35,20 +35,29 @@ def begin(
     """
     import jax
 
-    from starjax.commands import policy_evaluation
+    from starjax.commands import demonstrations, policy_evaluation
+    from starjax.data import redraw
     from starjax.report import scene_view, video
     from starjax.runtime import precompile
+    from starjax.training import frozen
     from starjax.training import precompile as training
 
     if "train" not in stages or len(jax.devices()) > 1:
         return Precompiled()
     row = methods.METHODS[methods.METHODS[name].weights_of]
-    step = policy = Precompiled().step
-    if not encoder:  # its features are no images: the step's batch is known only from the dataset
-        cameras = env.names.cameras
-        step = precompile.start(
-            lambda: training.step_program(row, config.policy, config.train, env.task, cameras)
-        )
+    policy = Precompiled().policy
+    demos, rows = demonstrations.size(config, env.task)
+
+    def see() -> None:
+        for frames in redraw.precompile(env, demos).values():
+            frozen.precompile(encoder, config.policy, frames)
+
+    if encoder and demos:
+        precompile.start(see)
+    shapes = env.task, env.names.cameras, demos, rows
+    step = precompile.start(
+        lambda: training.step_program(row, config.policy, config.train, *shapes)
+    )
     if "evaluate" in stages:
         vision = encoder.params if encoder else None
         policy = precompile.start(lambda: policy_evaluation.precompile(name, config, env, vision))

@@ -22,7 +22,7 @@ import jax
 import numpy as np
 
 from starjax import errors
-from starjax.data import schema, store
+from starjax.data import schema, store, windows
 from starjax.data.schema import DemoSettings
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import engine, episodes, sharing, success_quota, workers
@@ -137,6 +137,11 @@ def precompile(
     frame_bytes = schema.frame_bytes(schema.describe(env, trocars, settings))
     rules = _rules(settings, _lanes(DEFAULT_LAYOUT, total, frame_bytes, 1))
     engine.precompile(env, agent, params, trocars, rules, episodes.DEMONSTRATION)
+
+
+def rows(demos: int, max_steps: int) -> int:
+    """Returns the frames that a dataset of so many demonstrations has room for."""
+    return windows.padded_count(demos * min(max_steps, FRAME_GUESS))
 
 
 def _rules(settings: DemoSettings, lanes: int) -> engine.RolloutSettings:

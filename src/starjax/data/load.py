@@ -48,6 +48,7 @@ def load(
     images: bool = True,
     env: Any = None,
     sources: bool = False,
+    rows: int = 0,
     report: Callable[[str], None] = print,
 ) -> Demos:
     """Loads the successful episodes of a sealed dataset, after checking every byte of them.
@@ -61,6 +62,7 @@ def load(
       images: without them they stay on disk, whatever the residency; `frames` reads them.
       env: `sim.env.Env` that draws the images that were not recorded at its size.
       sources: keep the sources of images, for a training that draws some of them anew.
+      rows: room for so many frames on the device; programs are compiled for it.
       report: gets one line with the place and the bytes, before any is allocated.
 
     Raises:
@@ -84,7 +86,7 @@ def load(
     without = "" if images else " without images"
     where = whereabouts(place, bool(drawn))
     report(f"{len(records)} demonstrations, {files.size(total)}{without}: {where}")
-    dataset = _dataset(root, description, records, place, fields, drawn)
+    dataset = _dataset(root, description, records, place, fields, drawn, rows)
     if found and sources:
         rows = len(dataset.episode) - len(found.qpos)
         dataset = dataset.replace(
@@ -215,10 +217,11 @@ def _dataset(
     place: str,
     files_of: dict[str, str],
     drawn: Mapping[str, redraw.DrawnImages],
+    rows: int,
 ) -> windows.Dataset:
     length, start = _spans(records)
     count = int(length.sum())
-    rows = windows.padded_count(count) if place == "device" else count
+    rows = max(windows.padded_count(count), rows) if place == "device" else count
     episode = np.repeat(np.arange(len(records), dtype=np.int32), length)
     fields, images = {}, {}
     for name, file in files_of.items():

@@ -16,7 +16,7 @@ import numpy as np
 from starjax import errors
 from starjax.data import schema
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import episodes, workers
+from starjax.rollouts import episodes, programs, workers
 from starjax.runtime.precompile import Program
 
 # Images per call: as many on each device, because the batch size may change last bits. A core's
@@ -128,7 +128,7 @@ def image_sizes(env: Any) -> dict[str, int]:
         zeros = jnp.zeros(np.shape(env.p_world_ref)[0])
         return env.camera(env.reset(key, EnvParams(Trocar(zeros, zeros, zeros))))
 
-    shapes = jax.eval_shape(look, jax.random.key(0))
+    shapes = Program(look).shapes(jax.random.key(0))
     return {camera: frame.rgb.shape[0] for camera, frame in shapes.items()}
 
 
@@ -167,15 +167,7 @@ def sources(
             f"another version of {description['scene']['task']}",
             "collect it again",
         )
-    from starjax.sim.state import EnvParams, ImageSource
-
-    def start(key: jax.Array, trocar: Any) -> ImageSource:
-        state = env.reset(key, EnvParams(trocar))
-        still = jnp.zeros(0)  # replaced by each frame's
-        return ImageSource(still, state.trocar.p_world_trocar, state.layout, state.cameras)
-
-    trocars = schema.trocars_of(records)
-    starts = Program(jax.vmap(start))(_keys(description, records), trocars)
+    starts = _start_program(env.reset)(_keys(description, records), schema.trocars_of(records))
     folders = (root / "episodes" / record["key"] for record in records)
     joints = [np.load(folder / "qpos.npy", allow_pickle=False) for folder in folders]
     return Sources(np.concatenate(joints), starts)
@@ -198,19 +190,61 @@ def images_of(
     lengths = [record["length"] for record in records]
     episode = np.repeat(np.arange(len(records), dtype=np.int32), lengths)
 
-    def drawn(camera: str) -> Callable[[Any, Any], jax.Array]:
-        # An argument: as a constant it would make a program of its own for each seed.
-        @Program
-        def draw(episodes: Any, qpos: jax.Array, episode: jax.Array) -> jax.Array:
-            source = jax.tree.map(lambda leaf: leaf[episode], episodes)
-            return jax.vmap(env.draw)(source._replace(qpos=qpos))[camera].rgb
-
-        return functools.partial(draw, found.episodes)
-
     return {
-        camera: DrawnImages(drawn(camera), found.qpos, episode, size)
+        camera: DrawnImages(
+            functools.partial(_draw_program(env.draw, camera), found.episodes),
+            found.qpos,
+            episode,
+            size,
+        )
         for camera, size in image_sizes(env).items()
     }
+
+
+def precompile(env: Any, demos: int) -> dict[str, Any]:
+    """Compiles, in the background, the programs that draw the images of so many episodes.
+
+    Returns:
+      the shape of a batch of images by camera.
+    """
+    from starjax.sim.env import without_images
+
+    frame = programs.frame(without_images(env), episodes.DEMONSTRATION)
+    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), demos))
+    trocar = Trocar(*[jax.ShapeDtypeStruct((demos, len(env.p_world_ref)), np.float32)] * 3)
+    starts = _start_program(env.reset).prepare(keys, trocar)
+    rows = batch_size()
+    qpos = jax.ShapeDtypeStruct((rows, *frame["qpos"].shape), np.float32)
+    episode = jax.ShapeDtypeStruct((rows,), np.int32)
+    return {
+        camera: _draw_program(env.draw, camera).prepare(starts, qpos, episode)
+        for camera in image_sizes(env)
+    }
+
+
+@functools.lru_cache(maxsize=4)
+def _start_program(reset: Callable[..., Any]) -> Program:
+    """Returns the program from keys and trocars `[D]` to `Sources.episodes`."""
+    from starjax.sim.state import EnvParams, ImageSource
+
+    def draw_start(key: jax.Array, trocar: Any) -> ImageSource:
+        state = reset(key, EnvParams(trocar))
+        still = jnp.zeros(0)  # replaced by each frame's
+        return ImageSource(still, state.trocar.p_world_trocar, state.layout, state.cameras)
+
+    return Program(jax.vmap(draw_start))
+
+
+@functools.lru_cache(maxsize=8)
+def _draw_program(draw: Callable[..., Any], camera: str) -> Program:
+    """Returns the program from `Sources.episodes`, qpos and episodes `[B]` to images."""
+
+    # Episodes are an argument: as constants they would make a program of its own for each seed.
+    def draw_batch(episodes: Any, qpos: jax.Array, episode: jax.Array) -> jax.Array:
+        source = jax.tree.map(lambda leaf: leaf[episode], episodes)
+        return jax.vmap(draw)(source._replace(qpos=qpos))[camera].rgb
+
+    return Program(draw_batch)
 
 
 def _keys(description: Mapping[str, Any], records: Sequence[Mapping[str, Any]]) -> jax.Array:

@@ -107,16 +107,16 @@ def of_episodes(made: mdp.Episodes, lanes: int) -> EpisodeBatch:
         )
         return lanes, BatchStep(now, outcome, final)
 
-    one = jax.eval_shape(made.reset, jax.random.key(0))
+    one = Program(made.reset).shapes(jax.random.key(0))
 
     def empty() -> Lanes:
         keys = jax.vmap(jax.random.key)(jnp.zeros(lanes, jnp.uint32))
         state = jax.tree.map(lambda s: jnp.zeros((lanes, *s.shape), s.dtype), one)
         return Lanes(keys, jnp.zeros(lanes, jnp.int32), state)
 
-    observed = jax.eval_shape(made.observe, one)
-    advance, camera = Program(advance), Program(jax.vmap(made.camera))
-    return EpisodeBatch(made, empty, advance, camera, observed)
+    observed = Program(made.observe).shapes(one)
+    camera = Program(jax.vmap(made.camera))
+    return EpisodeBatch(made, empty, Program(advance), camera, observed)
 
 
 def seeded(lanes: Lanes, seeds: Any, which: Any) -> Lanes:

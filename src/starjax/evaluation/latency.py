@@ -47,8 +47,12 @@ def policy_ms(
     Returns:
       {p50, p95, p99} in ms, and n, the number of calls.
     """
+
+    def draw_inputs() -> Any:
+        return _inputs(policy_config, sensors, batch)
+
     # In one program: called as they are, the maps would be a hundred.
-    inputs = precompile_lib.Program(lambda: _inputs(policy_config, sensors, batch))()
+    inputs = precompile_lib.Program(draw_inputs)()
     # Weights on the host would be copied again at each call.
     params, stats = jax.device_put((params, stats))
     call = _program(policy.sample, _slots(sensors)).select(params, stats, *inputs)

@@ -67,7 +67,7 @@ def split(
         placed = [jax.device_put(*pair) for pair in zip(arguments, shardings, strict=True)]
         shares = [jax.tree.map(lambda x, d=device: _share(x, d), placed) for device in devices]
         # Traced here, once, and not in every thread.
-        program.trace(*shares[0])
+        program.shapes(*shares[0])
         with ThreadPoolExecutor(len(devices)) as pool:
             parts = list(pool.map(lambda share: program(*share), shares))
         specs = jax.tree.broadcast(out_specs, parts[0], is_leaf=_is_spec)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import episodes, placement
 from starjax.rollouts.agent import BatchAgent
+from starjax.runtime import precompile
 from starjax.types import Command
 
 
@@ -200,7 +201,7 @@ def _frame(env: _EnvFns, arms: int, record: episodes.Record) -> dict[str, jax.Sh
         batch = jax.tree.map(lambda x: jnp.asarray(x)[None], state)
         return jax.tree.map(lambda x: x[0], _fields(env, record, batch))
 
-    return jax.eval_shape(one, jax.random.key(0))
+    return precompile.Program(one).shapes(jax.random.key(0))
 
 
 def status(env: Any, carry: RolloutState) -> dict[str, Any]:

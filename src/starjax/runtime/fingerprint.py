@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 _PLAIN = (type(None), type(...), bool, int, float, complex, str, bytes)
@@ -129,7 +130,7 @@ class _Walk:
         self.total.update(repr(words).encode())
 
     def _array(self, x: Any) -> None:
-        if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key):
+        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
             self._words(str(x.dtype))
             x = jax.random.key_data(x)
         self._words(str(x.dtype), x.shape, getattr(x, "weak_type", False))

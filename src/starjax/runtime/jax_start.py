@@ -9,7 +9,7 @@ from typing import TextIO
 
 import starjax
 from starjax import errors
-from starjax.runtime import background
+from starjax.runtime import background, notice
 
 # Number of this process in a run of several, as jax and srun name it.
 _PROCESS_NUMBERS = ("JAX_PROCESS_ID", "SLURM_PROCID")
@@ -57,6 +57,7 @@ def require_devices(*modules: str) -> None:
             with contextlib.suppress(RuntimeError):  # a full GPU raises at its first real use
                 jax.device_put(0, device)
 
+    notice.once(lambda: announce("compiling; later starts find the programs in the cache"))
     started = background.run_in_background(start)
     for module in modules:
         importlib.import_module(module)

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from starjax.runtime import stored, xla
+from starjax.runtime import notice, stored, xla
 
 T = TypeVar("T")
 
@@ -22,7 +22,9 @@ _thread = threading.local()
 _tracer = ThreadPoolExecutor(1, thread_name_prefix="starjax-tracer")
 # First in, first out, because the earliest programs are needed first; a GPU's compiler uses several
 # cores itself. On two cores one compiler leaves the other core to the simulation.
-_compilers = ThreadPoolExecutor(1 if xla.cores() < 4 else 2, thread_name_prefix="starjax-compiler")
+_compilers = ThreadPoolExecutor(
+    min(6, max(1, xla.cores() // 2)), thread_name_prefix="starjax-compiler"
+)
 _SWITCH_S = 2e-4  # Python's 5 ms would stop each wait of the main work behind the tracer
 _queued: list[Future] = []
 
@@ -57,18 +59,18 @@ class Program:
     def select(self, *args: Any) -> Callable[..., Any]:
         """Returns the executable for arguments of these shapes, else the jitted function."""
         executable = self._executables.get(_signature(args)) if self._executables else None
-        return executable.result() if executable else self._call
+        return _awaited(executable) if executable else self._call
 
     def __call__(self, *args: Any) -> Any:
         return self.select(*args)(*args)
 
-    def trace(self, *args: Any) -> None:
-        """Traces the program for arguments of these shapes."""
+    def shapes(self, *args: Any) -> Any:
+        """Traces the program, and returns the shapes of its result without computing it."""
         with stored.arguments(args):
-            self._function.trace(*args)
+            return self._function.eval_shape(*args)
 
     def _call(self, *args: Any) -> Any:
-        with stored.arguments(args):
+        with stored.arguments(args), notice.call():
             return self._function(*args)
 
 
@@ -90,7 +92,7 @@ def start(job: Callable[[], T]) -> Callable[[], T | None]:
         try:
             result, started = queued.result()
             for executable in started:
-                executable.result()
+                _awaited(executable)
         except (Exception, CancelledError):
             return None
         return result
@@ -117,6 +119,14 @@ def until_end() -> Iterator[None]:
 def is_job() -> bool:
     """Returns whether this thread works for a job of `start`, and thus for no stage of a run."""
     return getattr(_thread, "is_job", False)
+
+
+def _awaited(executable: Future) -> Any:
+    """Returns a compiled program, perhaps after a wait of which the user is told."""
+    if executable.done():
+        return executable.result()
+    with notice.waiting():
+        return executable.result()
 
 
 def _submit(pool: ThreadPoolExecutor, work: Callable[[], Any]) -> Future:

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import jax
 from jax import export
 
-from starjax.runtime import files, fingerprint, garbage, package_files, tree_json, xla
+from starjax.runtime import files, fingerprint, garbage, notice, package_files, tree_json, xla
 
 KEPT = 4  # folders of other sources, e.g. of other versions in other environments
 _FREE = (
@@ -51,6 +51,7 @@ def program(function: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     def traced(*args: Any) -> Any:
+        notice.traced()
         with garbage.gc_paused():
             stored = _find(function, args)
             if stored is None:
@@ -174,6 +175,12 @@ def _folder() -> Path | None:
     if not (is_used and place and jax.config.jax_enable_compilation_cache):
         return None
     return Path(place) / "programs"
+
+
+def are_cached() -> bool:
+    """Returns whether programs of this version were stored on this machine and device before."""
+    folder = _folder()
+    return folder is not None and (folder / _sources(jax.local_devices()[0])).exists()
 
 
 @functools.lru_cache(maxsize=8)

@@ -58,7 +58,7 @@ def _decode(value: Any) -> Any:
     if path == "dict":
         return {name: _decode(part) for name, part in parts.items()}
     module, _, name = path.partition(":")
-    kind = functools.reduce(getattr, name.split("."), importlib.import_module(module))
+    kind: Any = functools.reduce(getattr, name.split("."), importlib.import_module(module))
     if isinstance(parts, list):
         return kind(*map(_decode, parts))
     is_node = _fields(kind)

@@ -132,13 +132,11 @@ def make(
 
 def without_images(env: Env) -> Env:
     """Returns the environment with observations that lack images and the task's fields."""
+    return env._replace(observe=_observe_tools)
 
-    def observe(state: EnvState) -> Observation:
-        return Observation(
-            state.pose, state.gripper, None, None, None, state.endoscope, state.wrist
-        )
 
-    return env._replace(observe=observe)
+def _observe_tools(state: EnvState) -> Observation:
+    return Observation(state.pose, state.gripper, None, None, None, state.endoscope, state.wrist)
 
 
 def for_policy(

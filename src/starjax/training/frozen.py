@@ -6,6 +6,7 @@ The key is a hash of all that decides the features: a resumed run, or another me
 encoder, finds them. Archives have checksums: a damaged part is noticed and made again.
 """
 
+import functools
 import hashlib
 import json
 from collections.abc import Callable, Generator, Mapping
@@ -93,7 +94,7 @@ def _computed(
     known: Mapping[Path, np.ndarray],
 ) -> dict[Path, np.ndarray]:
     """Computes and writes the parts of `spans` that are not `known`; `read` are their frames."""
-    see = _make_see(encoder, policy_config)
+    see = functools.partial(_see_program(policy_config), jax.device_put(encoder.params))
     batch = redraw.batch_size()
     is_drawn = isinstance(pictures, redraw.DrawnImages)
     look = pictures.draw_batch if is_drawn else pictures.__getitem__
@@ -118,16 +119,20 @@ def _computed(
     return parts
 
 
-def _make_see(encoder: Encoder, policy_config: config.PolicyConfig) -> Callable[[Any], jax.Array]:
-    """Makes the function from frames `[B, h, w, 3]` uint8 to features `[B, d_v]`."""
+def precompile(encoder: Encoder, policy_config: config.PolicyConfig, frames: Any) -> None:
+    """Compiles, in the background, the program of `features`, for batches of this shape."""
+    _see_program(policy_config).prepare(encoder.params, frames)
+
+
+@functools.lru_cache(maxsize=4)
+def _see_program(policy_config: config.PolicyConfig) -> Program:
+    """Returns the program of parameters and frames `[B, h, w, 3]` uint8 -> features `[B, d_v]`."""
     vision = generator.vision_encoder(policy_config)
 
-    @Program
     def see(params: Any, frames: jax.Array) -> Any:
         return vision.apply(params, inputs.centre_crop(policy_config, frames))
 
-    params = jax.device_put(encoder.params)
-    return lambda frames: see(params, frames)
+    return Program(see)
 
 
 def _key(

@@ -49,13 +49,13 @@ def resident(
       dataset: leaves are jax arrays.
       frames: `[n]` frame numbers to draw from.
       ahead: trace the program now, and compile it in the background until the first step.
-      program: from `batch_program` of an equal setup, perhaps prepared.
+      program: from `batch_program` or `loop_program` of an equal setup, perhaps prepared.
       draw_images: draws those that training draws anew; None without any.
     """
     layout = setup.layout
     data = _on_devices(setup, dataset, frames)
     if steps.runs_in_a_loop(setup.policy_config):
-        return _looped(setup, data, ahead)
+        return _looped(setup, data, ahead, program or loop_program(setup))
     # A program of its own draws the batch: the large one is the same for any number of frames, and
     # can be compiled before these are known.
     split = devices.batch_sharding(layout.mesh)
@@ -105,22 +105,22 @@ def streamed(
     return _stepper(setup.layout, run)
 
 
-def _looped(setup: Setup, data: tuple[Any, ...], ahead: bool) -> Stepper:
+def _looped(setup: Setup, data: tuple[Any, ...], ahead: bool, program: Program) -> Stepper:
     """Returns many steps in one program, of whose arguments the dataset is one."""
     layout = setup.layout
-    program = _program(functools.partial(steps.resident_steps, setup), layout)
 
     def counted(count: int) -> jax.Array:
         return devices.replicate(np.int32(count), layout.mesh)
 
-    if ahead:
-        program.prepare(layout.shapes(), *data, counted(1))
+    arguments = layout.shapes(), *data, counted(1)
+    if ahead and not program.is_prepared(*arguments):
+        program.prepare(*arguments)
     return _stepper(layout, lambda carry, count: program(carry, *data, counted(count)))
 
 
 def _on_devices(setup: Setup, dataset: windows.Dataset, frames: np.ndarray) -> tuple[Any, ...]:
     """Returns a dataset, frames to draw from and their number on every device."""
-    rows = windows.padded_count(len(frames))
+    rows = windows.padded_count(max(len(frames), len(dataset.episode)))
     available = np.pad(frames, (0, rows - len(frames))), np.int32(len(frames))
     return devices.replicate((dataset, *available), setup.layout.mesh, may_alias=None)
 
@@ -159,6 +159,19 @@ def _drawn_by(carry: StepCarry) -> tuple[Any, Any]:
 def batch_program(setup: Setup) -> Program:
     """Returns the program of one step on a batch: (StepCarry, Batch) -> StepCarry."""
     return _program(functools.partial(steps.train_step, setup), setup.layout)
+
+
+def loop_program(setup: Setup) -> Program:
+    """Returns the program of many steps: the arguments of `step.resident_steps` -> StepCarry."""
+    return _program(functools.partial(steps.resident_steps, setup), setup.layout)
+
+
+def loop_arguments(setup: Setup, dataset: windows.Dataset) -> tuple[Any, ...]:
+    """Returns shapes and shardings of the arguments of steps on a dataset of these shapes."""
+    whole, number = devices.replicated(setup.layout.mesh), jax.ShapeDtypeStruct((), jnp.int32)
+    rows = jax.ShapeDtypeStruct(dataset.episode.shape, jnp.int32)
+    data = jax.tree.map(lambda x: x.update(sharding=whole), (dataset, rows, number, number))
+    return setup.layout.shapes(), *data
 
 
 def abstract_arguments(setup: Setup, batch: windows.Batch) -> tuple[StepCarry, windows.Batch]:
