@@ -1,4 +1,4 @@
-"""Stored programs: equal to the bit, and traced again after any change of what they are made of."""
+"""Stored programs: equal to the bit, and traced again after a change of sources or values."""
 
 import hashlib
 import importlib
@@ -78,7 +78,7 @@ def part(tmp_path, monkeypatch):
 
 
 def forget_sources():
-    """Does what a new process does: it reads all sources again."""
+    """Reads all sources again, like a new process."""
     importlib.invalidate_caches()
     for function in (package_files._files, package_files._digest, stored._sources):
         function.cache_clear()
@@ -205,7 +205,7 @@ def test_a_folder_that_cannot_be_written_changes_nothing(folder, part, monkeypat
         assert_equal(found, usual)
 
 
-def test_what_cannot_be_read_or_exported_is_traced_as_ever(folder, part, capsys):
+def test_what_cannot_be_read_or_exported_is_traced_anew(folder, part, capsys):
     class Opaque:
         scale = 2.0
 
@@ -230,7 +230,7 @@ def test_donated_arguments_are_given_away(folder, part):
     assert len(part.TRACES) == 1
 
 
-def test_several_devices_and_tracers_are_traced_as_ever(folder, part):
+def test_several_devices_and_tracers_are_traced_anew(folder, part):
     state = part.State(jax.random.key(0), jnp.arange(4.0))
     program = Program(part.steps(3, 2.0))
     jax.eval_shape(program, state, 0.5)

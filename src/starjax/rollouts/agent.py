@@ -91,7 +91,7 @@ def from_policy(sample: Callable[..., Command], obs_horizon: int, execute: int) 
     if obs_horizon > execute + 1:
         raise errors.UsageError("obs_horizon", f"at most execute + 1 = {execute + 1}", obs_horizon)
 
-    # Traced once for the programs that start and that go on.
+    # Traced once for the programs that start and that advance.
     sample = jax.jit(sample, inline=True)
 
     def init(params: Any, keys: jax.Array, state: Any, observe: Observe) -> Plan:

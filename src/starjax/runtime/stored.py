@@ -1,9 +1,9 @@
 """Traced programs on disk: a later process calls them without tracing their functions again.
 
-jax's cache holds compiled programs and is asked with a program's text, for which Python traces it
-first. Here the key is a digest of all that the text is made of: sources, the values in the
-function's closures, jax's settings, shapes, the device. A function that `fingerprint` cannot read,
-or that jax cannot export, is traced as ever. Like jax's cache, the folder is trusted.
+The key of jax's cache is a program's text, for which Python traces it first. Here the key is a
+digest of everything that decides the text: sources, the values in the function's closures, jax's
+settings, shapes, the device. A function that `fingerprint` cannot read, or that jax cannot export,
+is traced in each process. Like jax's cache, the folder is trusted.
 """
 
 import contextlib
@@ -91,7 +91,7 @@ def _find(function: Callable[..., Any], args: Any) -> Stored | None:
 
 
 def _explain(line: str) -> None:
-    """Prints a line if the user asks why jax compiles (JAX_EXPLAIN_CACHE_MISSES=1)."""
+    """Prints a line if jax explains cache misses, too (JAX_EXPLAIN_CACHE_MISSES=1)."""
     if jax.config.jax_explain_cache_misses:
         print(f"starjax: {line}", file=sys.stderr)
 
@@ -122,7 +122,7 @@ def _export(function: Callable[..., Any], args: Any, platform: str, path: Path) 
     platforms = None if platform == jax.default_backend() else [platform]
     exported = export.export(jax.jit(flat), platforms=platforms)(*shapes)
     stored = Stored(exported, results[-1])
-    with contextlib.suppress(OSError, TypeError, ValueError):  # as in a folder of someone else
+    with contextlib.suppress(OSError, TypeError, ValueError):  # e.g. no permission
         result = json.dumps(tree_json.encode(stored.result)).encode()
         content = result + b"\n" + bytes(exported.serialize())
         _evict(path.parent)
@@ -170,7 +170,7 @@ def _device(args: Any) -> jax.Device | None:
 
 
 def _folder() -> Path | None:
-    """Returns the folder beside jax's compiled programs; None where jax keeps none."""
+    """Returns the folder, inside that of jax's compiled programs; None if jax keeps no programs."""
     place = jax.config.jax_compilation_cache_dir
     if not (is_used and place and jax.config.jax_enable_compilation_cache):
         return None

@@ -23,7 +23,7 @@ def encode(structure: Any) -> Any:
 
 
 def decode(value: Any) -> Any:
-    """Returns the `PyTreeDef` of `encode`; raises an error of any type if the value has none."""
+    """Returns the `PyTreeDef` of `encode`; any error may mean another value."""
     return jax.tree.structure(_decode(value))
 
 
