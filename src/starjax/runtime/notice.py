@@ -10,7 +10,7 @@ _reports: list[Callable[[], None]] = []
 
 
 def once(report: Callable[[], None]) -> None:
-    """Has `report` called once, as soon as this process has waited for compilers for seconds."""
+    """Registers a function, called once if this process waits for compilers for seconds."""
     _reports[:] = [report]
 
 

@@ -47,7 +47,7 @@ class Stored(NamedTuple):
 def program(function: Callable[..., Any]) -> Callable[..., Any]:
     """Returns `function` for `jax.jit`: its trace calls the stored program, if there is one.
 
-    It must be called inside `arguments`, which say on which device it will run.
+    It must be called inside `arguments`, which decide its device.
     """
 
     def traced(*args: Any) -> Any:
@@ -64,7 +64,7 @@ def program(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @contextlib.contextmanager
 def arguments(args: Any) -> Iterator[None]:
-    """Names the arguments, or their shapes with shardings, of the program called in the block."""
+    """Sets the arguments, or their shapes with shardings, of the program called in the block."""
     before = getattr(_thread, "args", None)
     _thread.args = args
     try:
