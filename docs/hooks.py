@@ -1,7 +1,8 @@
 """Builds pages from files outside docs/, and rewrites links that lead there.
 
 Links are written as they work in a checkout. A page `<!-- generated: NAME -->` gets the tables of
-NAME in place of the mark, and a paragraph of one link to a film becomes a player.
+NAME in place of the mark, a paragraph of one link to a film becomes a player, and a block of
+`math`, which code hosts set, becomes MathML.
 """
 
 import re
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import parts
 import settings
+from latex2mathml import converter
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
@@ -37,7 +39,8 @@ GENERATED = {
 _LINK = re.compile(r"\[([^\]]*)\]\(([^)#\s]+)(#[^)]*)?\)")
 _MARK = re.compile(r"<!-- generated: (\w+) -->")
 _FILM = re.compile(r"^\[([^\]]*)\]\((\S+\.mp4)\)$", re.MULTILINE)
-_PLAYER = '<video controls muted playsinline preload="metadata" src="{}" aria-label="{}"></video>'
+_MATH = re.compile(r"^```math\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+_PLAYER = '<video{} controls muted playsinline preload="metadata" src="{}" aria-label="{}"></video>'
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
@@ -61,12 +64,14 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Rewrites links, fills generated tables in, and makes films players."""
+    """Rewrites links, fills generated tables in, and sets films and equations."""
     source = ROOT / "docs" / page.file.src_uri
     if page.file.src_uri not in COPIES:
         markdown = relinked(markdown, source, page.file.src_uri)
     markdown = _MARK.sub(lambda match: GENERATED[match[1]](), markdown)
-    return _FILM.sub(lambda match: _PLAYER.format(match[2], match[1]), markdown)
+    markdown = _MATH.sub(lambda match: converter.convert(match[1], display="block"), markdown)
+    place = ' class="at-right"' if page.is_homepage else ""
+    return _FILM.sub(lambda match: _PLAYER.format(place, match[2], match[1]), markdown)
 
 
 def relinked(text: str, source: Path, page: str) -> str:
