@@ -31,10 +31,10 @@ docs: .venv/dev.stamp
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
 
-.venv/run.stamp: pyproject.toml constraints.txt | .venv/bin/python
-	$(BIN)/pip install -q -e '.[train,report$(CUDA)]' -c constraints.txt
+.venv/run.stamp: pyproject.toml weights/pyproject.toml constraints.txt | .venv/bin/python
+	$(BIN)/pip install -q -e '.[train,report$(CUDA)]' -e ./weights -c constraints.txt
 	touch $@
 
-.venv/dev.stamp: pyproject.toml constraints.txt | .venv/bin/python
-	$(BIN)/pip install -q -e '.[dev]' -c constraints.txt
+.venv/dev.stamp: pyproject.toml weights/pyproject.toml constraints.txt | .venv/bin/python
+	$(BIN)/pip install -q -e '.[dev]' -e ./weights -c constraints.txt
 	touch $@

@@ -5,7 +5,6 @@ import subprocess
 import sys
 import textwrap
 
-import mistakes
 import pytest
 
 from starjax import cli, errors
@@ -52,12 +51,6 @@ def test_guard_turns_what_a_user_can_mend_into_one_line(error, code, word, capsy
     assert cli.guard(command, []) == code
     said = capsys.readouterr().err
     assert word in said and len(said.strip().splitlines()) == 1
-
-
-@pytest.mark.parametrize("argv", ["exercise --seed -1", "place fr6 grasper board --seed -1"])
-def test_an_old_name_of_a_command_warns_and_works(argv):
-    with pytest.warns(FutureWarning, match="six-blocks|find-mount"), mistakes.of("seed", -1):
-        cli.dispatch(argv.split())
 
 
 def test_guard_lets_a_fault_of_the_program_through():

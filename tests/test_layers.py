@@ -21,6 +21,7 @@ ROWS = (
     ("deploy", "envs"),
     ("report",),
     ("commands",),
+    ("api",),
     ("addons",),
 )
 COMMANDS = {"commands", "experiments", "doctor", "cli", "__main__"}  # one layer

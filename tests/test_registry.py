@@ -6,7 +6,6 @@ import sys
 import pytest
 
 from starjax import cli, config, errors, methods, rcm, registry
-from starjax.addons.formats import base
 from starjax.commands import policy_args, presets, run_settings
 from starjax.sim import registries
 
@@ -78,19 +77,6 @@ def test_a_name_of_starjax_is_refused(install):
     install("lab_e", ARM.replace("BENT", "FR5").format(name="fr5"), arms="fr5")
     assert registries.arms.names().count("fr5") == 1
     assert refused("fr5").got == "starjax, lab_e"
-
-
-def test_a_broken_format_leaves_the_others(install, tmp_path):
-    code = (
-        "from starjax.addons.formats import zarr\nTABLES = zarr.FORMAT._replace(recognises=len)\n"
-    )
-    install("lab_f", code, formats="tables")
-    install("lab_g", "1 / 0", formats="notes")
-    (tmp_path / "d" / "meta").mkdir(parents=True)
-    (tmp_path / "d" / "meta" / "info.json").touch()
-    assert base.detect(tmp_path / "d") == "lerobot"
-    with pytest.warns(UserWarning, match="skipped"), pytest.raises(errors.UsageError):
-        base.detect(tmp_path)  # of no format: the broken ones are asked too
 
 
 def test_broken_mounts_leave_those_of_others(install):

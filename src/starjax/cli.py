@@ -74,8 +74,6 @@ CORE = {
 COMMANDS = {**CORE, **extensions.commands()}
 _REGISTRY = Registry("command", COMMANDS, "starjax.extensions:Subcommand")
 
-# Names of the previous release; dropped in the next.
-_RENAMED = {"exercise": "six-blocks", "place": "find-mount"}
 _WRITING = (errno.ENOSPC, errno.EROFS, errno.EDQUOT)
 _STORAGE = (
     *_WRITING, errno.EACCES, errno.EPERM, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG
@@ -174,9 +172,6 @@ def dispatch(argv: Sequence[str]) -> int:
     if name == "--version":
         print(__version__)
         return 0
-    if name in _RENAMED:
-        errors.warn_renamed(name, _RENAMED[name])
-        name = _RENAMED[name]
     extras.require(name, *command(name).extras)
     return load(name)(argv[1:])
 

@@ -45,6 +45,7 @@ class AddOn(NamedTuple):
       commands: subcommands.
       parts: kind of part -> name -> path, e.g. of a `Task`.
       kinds: kinds of parts.
+      policies: names of trained policies of its tasks, see `policies.packaged`.
       hooks: place in the core -> path of the function that it calls, see `hook`.
     """
 
@@ -53,6 +54,7 @@ class AddOn(NamedTuple):
     parts: Mapping[str, Mapping[str, str]] = {}
     kinds: Mapping[str, PartKind] = {}
     hooks: Mapping[str, str] = {}
+    policies: tuple[str, ...] = ()
 
 
 @functools.cache
@@ -75,6 +77,11 @@ def parts(kind: str) -> dict[str, str]:
         for table in tables().values()
         for name, path in table.parts.get(kind, {}).items()
     }
+
+
+def policies() -> list[str]:
+    """Returns the names of trained policies of add-ons' tasks."""
+    return [name for table in tables().values() for name in table.policies]
 
 
 def kinds() -> dict[str, PartKind]:

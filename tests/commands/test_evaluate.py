@@ -13,9 +13,6 @@ import safetensors.numpy
 import stubs
 
 from starjax import config, config_json, rcm
-from starjax.addons.six_blocks import command as six_blocks
-from starjax.addons.six_blocks import environment as exercising
-from starjax.addons.six_blocks import task as six
 from starjax.commands import (
     calibrate,
     evaluate,
@@ -96,14 +93,15 @@ def test_a_file_alone_is_scored_by_its_own_settings(file, capsys):
 
 
 def test_a_packaged_policy_is_scored_by_its_name(file, monkeypatch, capsys):
-    monkeypatch.setattr(packaged, "FOLDER", file.parent / "weights")
-    packaged.FOLDER.mkdir()
-    file.rename(packaged.FOLDER / "compact.safetensors")
+    folder = file.parent / "weights"
+    monkeypatch.setattr(packaged, "folders", lambda: [folder])
+    folder.mkdir()
+    file.rename(folder / "compact.safetensors")
     assert evaluate.main(["--policy", "compact", "--eval.trials=1", "--eval.time-limit-s=1"]) == 0
     said = capsys.readouterr().out
     assert "DP-RCM-2 of compact\n" in said and "into runs/evaluate/compact-seed0-1x1s\n" in said
     assert (file.parent / "runs" / "evaluate" / "compact-seed0-1x1s" / "result.json").is_file()
-    assert [path.name for path in packaged.FOLDER.iterdir()] == ["compact.safetensors"]
+    assert [path.name for path in folder.iterdir()] == ["compact.safetensors"]
 
 
 @pytest.mark.parametrize("guess", [False, True])
@@ -291,7 +289,7 @@ def test_a_policy_called_policy_is_known_by_its_folder(tmp_path):
     other = tmp_path / "compact.safetensors"
     other.write_bytes(b"c")
     assert policy_args.label(other).startswith("compact-")
-    assert policy_args.label(packaged.FOLDER / "compact.safetensors") == "compact"
+    assert policy_args.label(packaged.folders()[-1] / "compact.safetensors") == "compact"
 
 
 def test_sweeps_of_one_run_keep_their_trials_apart(file, capsys):
@@ -434,32 +432,6 @@ def test_a_policy_of_states_meets_no_disturbance_of_images(file):
         stressed("--disturbance", "smoke")
     with mistakes.of("levels", 5.0):
         stressed("--disturbance", "observation_delay", "--levels", "0", "5")
-
-
-def test_the_exercise_is_for_policies_of_its_task(file):
-    with mistakes.of("RUN or --policy", "one for reach"):
-        six_blocks.main(["--policy", "mine.safetensors"])
-
-
-def test_the_expert_at_the_exercise(file, monkeypatch, capsys):
-    env, task = stubs.make_env(), stubs.make_task()._replace(labels=("moved",))
-    env = env._replace(
-        task=task, labels=lambda state: {"moved": 5 + state.success.astype(jnp.int32)}
-    )
-    monkeypatch.setattr(exercising, "make", lambda *_, **__: env)
-    monkeypatch.setattr(exercising, "reset_each_block", lambda agent: agent)
-    monkeypatch.setattr(six, "TASK", task)
-    assert six_blocks.main(["--trials", "2"]) == 0
-    (result,) = file.parent.rglob("exercise.json")
-    found = json.loads(result.read_text())
-    assert found["expert"] == "default" and found["complete"]["trials"] == 24
-    won = found["complete"]["successes"]
-    assert won and found["moved"]["counts"] == [0, 0, 0, 0, 0, 24 - won, won]
-    assert 0 < found["seconds"]["median"] <= found["seconds"]["p90"] < found["people"]["limit_s"]
-    chunks = {path: path.stat().st_mtime_ns for path in result.parent.rglob("chunk*")}
-    assert six_blocks.main(["--trials", "2"]) == 0 and chunks
-    assert all(path.stat().st_mtime_ns == then for path, then in chunks.items())
-    assert f"in {won} of 24 trials" in capsys.readouterr().out
 
 
 CALIBRATE = ["--policy=mine.safetensors", "--trials=120", "--time-limit-s=1", "--alpha=0.2"]

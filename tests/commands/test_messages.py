@@ -26,9 +26,9 @@ def test_the_plan_has_the_scene_the_observation_and_the_numbers():
     assert "image, 64 px" in said and "from scratch" in said and "state" not in said
 
 
-@pytest.mark.parametrize(("limit_s", "is_short"), [(49.0, True), (50.0, False)])
+@pytest.mark.parametrize(("limit_s", "is_short"), [(28.0, True), (29.0, False)])
 def test_a_plan_says_if_trials_end_before_demonstrations_do(limit_s, is_short):
-    scene = dataclasses.replace(SMOKE.scene, task="suture_throw")
+    scene = dataclasses.replace(SMOKE.scene, task="endoscope_track")
     trials = dataclasses.replace(SMOKE.eval, time_limit_s=limit_s)
     said = plan_text.plan(dataclasses.replace(SMOKE, scene=scene, eval=trials), messages.STAGES)
     assert ("--eval.time-limit-s" in said) == is_short
@@ -58,7 +58,7 @@ def test_the_plan_says_where_devices_cannot_share_a_batch(monkeypatch):
 def test_an_encoder_says_where_it_began_and_for_which_task(tmp_path, monkeypatch):
     assert plan_text.encoder(presets.PRESETS["cpu"]).startswith("frozen, from compact (pretrained")
     settings = config.RunConfig(policy=config.PolicyConfig(encoder_weights="compact"))
-    monkeypatch.setattr(packaged, "FOLDER", tmp_path)
+    monkeypatch.setattr(packaged, "folders", lambda: [tmp_path])
     assert plan_text.encoder(settings) == "trained further, from compact"  # as of torchvision's
     made = fakes.trained(policy=settings.policy, params={"unet": np.ones(3)})
     policy_file.save(tmp_path / "compact.safetensors", made)

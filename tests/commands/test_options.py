@@ -11,8 +11,6 @@ import mistakes
 import pytest
 
 from starjax import cli, config, extras
-from starjax.addons.formats.commands import export_command, import_command
-from starjax.addons.six_blocks import command as six_blocks
 from starjax.commands import (
     bench,
     completion,
@@ -32,12 +30,9 @@ OPTIONS = {
     "evaluate": evaluate.EvaluateArgs,
     "sweep": sweep.SweepArgs,
     "stress": stress.StressArgs,
-    "six-blocks": six_blocks.SixBlocksArgs,
     "bench": bench.BenchArgs,
     "pack": pack.PackArgs,
     "report": report_command.ReportArgs,
-    "export": export_command.ExportArgs,
-    "import": import_command.ImportArgs,
 }
 
 
@@ -72,7 +67,6 @@ def settings(typed: str) -> config.RunConfig:
         ("sweep", "x --eval.time-limit-s soon", "--eval.time-limit-s", "'soon'"),
         ("stress", "", "RUN or --policy", "none"),
         ("stress", "--policy compact --levels 1", "levels", "none"),
-        ("six-blocks", "x --policy y", "RUN or --policy", "both"),
         ("stress", "--policy compact --disturbance rain", "disturbance", "'rain'"),
         ("run", "--demos.randomise rain=1", "demos.randomise", "'rain'"),
         ("run", "--demos.randomise smoke", "demos.randomise", "smoke"),

@@ -95,8 +95,7 @@ def test_a_package_that_cannot_be_imported_is_a_line_of_the_list(monkeypatch, ca
         ("reach", "grasper", "stardiff_pose", "tool"),
         ("peg_transfer", "needle_driver", "dp_ee_wrist", ""),
         ("peg_transfer", "needle_driver", "stardiff", ""),
-        ("needle_regrasp", "needle_driver", "stardiff", "method"),
-        ("needle_regrasp", "needle_driver", "dp_rcm6", ""),
+        ("needle_handover", "needle_driver", "stardiff_pose", ""),
     ],
 )
 def test_methods_go_with_tools_that_they_can_move(task, tool, method, argument):

@@ -26,6 +26,8 @@ def folder(pytestconfig, tmp_path):
     """A fresh clone: the files that make reads."""
     for name in ("Makefile", "pyproject.toml", "constraints.txt"):
         shutil.copy(pytestconfig.rootpath / name, tmp_path)
+    (tmp_path / "weights").mkdir()
+    shutil.copy(pytestconfig.rootpath / "weights" / "pyproject.toml", tmp_path / "weights")
     return tmp_path
 
 

@@ -11,7 +11,8 @@ import tomllib
 import pytest
 
 from starjax import cli, errors, methods, rcm
-from starjax.addons.formats import base, mapping
+from starjax.addons.formats import mapping
+from starjax.addons.formats.base import FORMATS
 from starjax.commands import presets
 from starjax.evaluation.disturbances import DISTURBANCES
 from starjax.learners import LEARNERS
@@ -79,7 +80,7 @@ def test_programs_run(page, tmp_path, monkeypatch):
 def test_configurations_are_read(page, tmp_path):
     """Entry points are of groups that are looked at; anything else is a mapping of a dataset."""
     kinds = (registries.tasks, registries.arms, registries.tools, registries.workspaces, LEARNERS)
-    groups = {f"starjax.{one.kind}s" for one in (*kinds, base.FORMATS, DISTURBANCES)}
+    groups = {f"starjax.{one.kind}s" for one in (*kinds, FORMATS, DISTURBANCES)}
     rows = (methods.METHODS, rcm.ACTION_SPACES, presets.PRESETS)
     groups |= {f"starjax.{one.registry.kind}s" for one in rows} | {
         "starjax.policies",

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from starjax import rcm
-from starjax.addons.playground import environment as playground
 from starjax.envs import mdp, ranges, settings
 from starjax.sim import registries
 from starjax.types import Command, Pose
@@ -18,13 +17,9 @@ STEPS = 40
 
 
 @pytest.fixture(scope="module")
-def env():
-    return playground.make("reach", trocar="unseen", max_episode_steps=STEPS)
-
-
-@pytest.fixture(scope="module")
-def start(env):
-    return jax.jit(env.reset)(jax.random.key(1))
+def start():
+    made = mdp.make(settings.make(task="reach", trocar="unseen", max_episode_steps=STEPS))
+    return jax.jit(made.reset)(jax.random.key(1))
 
 
 def frame(task):
@@ -53,14 +48,14 @@ def test_the_workspace_lies_within_the_bounds_of_actions(task, space):
 
 @pytest.mark.parametrize("space", ["se3", "rcm1", "rcm2", "rcm3", "rcm4"])
 @pytest.mark.parametrize("control", settings.CONTROLS)
-def test_an_action_says_the_pose_that_it_is_made_from(env, start, space, control):
+def test_an_action_says_the_pose_that_it_is_made_from(start, space, control):
     made = mdp.make(settings.make(task="reach", action_space=space, control=control))
-    near = start.data.pose.p + jnp.array([0.002, -0.001, -0.014])
+    near = start.pose.p + jnp.array([0.002, -0.001, -0.014])
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(
-        jnp.concatenate([jnp.array([[0.1]]), near], -1), start.data.measured_trocar
+        jnp.concatenate([jnp.array([[0.1]]), near], -1), start.measured_trocar
     )
     command = Command(pose, jnp.array([0.5]))
-    data = start.data.replace(pose=Pose(pose.R, near + 0.001))
+    data = start.replace(pose=Pose(pose.R, near + 0.001))
     again = made.decode(data, made.encode(data, command))
     np.testing.assert_allclose(again.pose.R, pose.R, atol=2e-4)
     np.testing.assert_allclose(again.pose.p, pose.p, atol=2e-6)
@@ -71,8 +66,8 @@ def test_an_action_says_the_pose_that_it_is_made_from(env, start, space, control
 def test_whatever_the_action_the_shaft_goes_through_the_trocar(start, space):
     made = mdp.make(settings.make(task="reach", action_space=space))
     actions = jax.random.uniform(jax.random.key(2), (500, made.action_size), minval=-3, maxval=3)
-    command = jax.vmap(made.decode, (None, 0))(start.data, actions)
-    error = rcm.rcm_error(command.pose, start.data.trocar.p_world_trocar)
+    command = jax.vmap(made.decode, (None, 0))(start, actions)
+    error = rcm.rcm_error(command.pose, start.trocar.p_world_trocar)
     assert float(error.max()) < 1e-6
 
 
@@ -106,24 +101,23 @@ def test_a_straight_tool_has_no_actions_of_a_wrist():
 
 def outcome(start, reward="dense", **changed):
     given = settings.make(task="reach", reward=reward, max_episode_steps=STEPS)
-    after = start.data.replace(step=start.data.step + 1, **changed)
-    return mdp.make(given).judge(start.data, after)
+    after = start.replace(step=start.step + 1, **changed)
+    return mdp.make(given).judge(start, after)
 
 
 def test_rewards(start):
     yes = jnp.ones((), bool)
-    data = start.data.replace(reward=jnp.float32(0.25))
-    begun = start.replace(data=data)
+    begun = start.replace(reward=jnp.float32(0.25))
     assert float(outcome(begun).reward) == -0.75
-    won = begun.replace(data=data.replace(reward=jnp.float32(1.0)))
+    won = begun.replace(reward=jnp.float32(1.0))
     found = outcome(won, success=yes)
     assert float(found.reward) == 0.0 and found.terminated and not found.truncated
     lost = outcome(begun, lost=yes)
     assert float(lost.reward) == -0.75 - (STEPS - 1) and lost.terminated
     assert outcome(begun, invalid=yes).terminated
-    late = begun.replace(data=data.replace(step=jnp.int32(STEPS - 1)))
+    late = begun.replace(step=jnp.int32(STEPS - 1))
     assert outcome(late).truncated and not outcome(late).terminated
     assert float(outcome(begun, "sparse").reward) == 0.0
     assert float(outcome(begun, "sparse", success=yes).reward) == 1.0
-    over = begun.replace(data=data.replace(step=jnp.int32(STEPS)))
+    over = begun.replace(step=jnp.int32(STEPS))
     assert float(outcome(over).reward) == 0.0

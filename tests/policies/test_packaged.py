@@ -83,7 +83,7 @@ def folder(tmp_path, monkeypatch):
     place = tmp_path / "weights"
     policy_file.save(place / "compact.safetensors", made, half=True)
     (place / "compact.json").write_text('{"method": "dp_rcm2"}')
-    monkeypatch.setattr(packaged, "FOLDER", place)
+    monkeypatch.setattr(packaged, "folders", lambda: [place])
     monkeypatch.chdir(tmp_path)
     return place
 
@@ -104,6 +104,30 @@ def test_faults_of_a_packaged_policy_are_found(folder):
     assert len(faults("compact")) == 2 and "not a readable" in faults("compact")[1]
 
 
+def test_an_encoder_alone_stands_for_that_of_its_policy():
+    """Names of features and runs hold its fingerprint, so presets find what they did before."""
+    alone = packaged.find_encoder("", "compact")
+    prints = [
+        policy_file.fingerprint(policy_file.load(path).params["vision"])[:16]
+        for path in (alone, packaged.find("", "compact"))
+    ]
+    assert prints == ["d731721be39fb57b"] * 2 and alone.stat().st_size < 0.3e6
+
+
+def test_the_distribution_is_found_installed_and_in_a_checkout(tmp_path, monkeypatch):
+    for name, place in (("installed", tmp_path / "site"), ("checkout", tmp_path / "weights")):
+        package = place / f"weights_{name}"
+        package.mkdir(parents=True)
+        (package / "__init__.py").touch()
+        (package / "compact.safetensors").touch()
+    monkeypatch.setattr(packaged, "CHECKOUT", tmp_path / "weights")
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    for name in ("installed", "checkout"):
+        monkeypatch.setattr(packaged, "PACKAGE", f"weights_{name}")
+        assert packaged.locate("compact").parent.name == f"weights_{name}"
+        assert packaged.is_packaged(packaged.locate("compact"))
+
+
 def test_a_name_is_a_file_of_the_package(folder):
     assert packaged.names() == ["compact"]
     Path("compact").touch()
@@ -121,13 +145,15 @@ def test_other_words_are_paths(folder):
 
 
 def test_a_missing_file_is_one_line_that_lists_the_names(folder, tmp_path, monkeypatch):
-    (folder / "large.safetensors").touch()
-    expected = "--policy: expected a file or one of compact, large, got compcat"
+    (folder / "peg_transfer_cpu.safetensors").touch()
+    (folder / "unknown.safetensors").touch()
+    expected = "--policy: expected a file or one of compact, peg_transfer_cpu, got compcat"
     with pytest.raises(errors.UsageError) as caught:
         packaged.find("--policy", "compcat")
     assert str(caught.value).startswith(expected) and "did you mean compact" in str(caught.value)
-    monkeypatch.setattr(packaged, "FOLDER", tmp_path / "none")
-    with pytest.raises(errors.UsageError, match=r"^--policy: expected a file, got compact$"):
+    monkeypatch.setattr(packaged, "folders", lambda: [tmp_path / "none"])
+    line = r"^--policy: expected a file, got compact; .*pip install -e ./weights$"
+    with pytest.raises(errors.UsageError, match=line):
         packaged.find("--policy", "compact")
 
 

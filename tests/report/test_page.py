@@ -11,7 +11,6 @@ import re
 import pytest
 from report.conftest import edited
 
-from starjax.addons.viewer import playback_3d
 from starjax.report import (
     build,
     captions,
@@ -125,7 +124,7 @@ def test_no_text_of_a_result_is_markup(several, count):
     about |= {"hardware": {"backend": "gpu", "devices": [attack], "cpu": attack, "cores": 2}}
     run = edited(several[-1], about=about, config={"preset": attack, "seed": 0, attack: attack})
     runs = [*several[: count - 1], run._replace(label=attack)]
-    playback = playback_3d.Playback(attack, attack)
+    playback = page.Playback(attack, attack)
     text = page.render(runs, runs[-1], {}, None, playback)
     assert "<script" not in text and "49" not in re.sub(r"\d[\d.,/]*\d", "", text)
     shown = html.unescape(re.sub(r"<[^>]*>", "", text))

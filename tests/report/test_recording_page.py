@@ -1,15 +1,12 @@
 """The page of a recording: its figures are the motion's, and any dataset has one."""
 
 import io
-import json
 
-import mistakes
 import numpy as np
-import openh
 import pytest
 import recorded
 
-from starjax.commands import inspect_command, inspect_page
+from starjax.commands import inspect_page
 from starjax.data import recordings
 from starjax.report import recording_figures, recording_page
 
@@ -93,19 +90,8 @@ def test_the_page_shows_images_of_every_camera_side_by_side():
     assert text.count("data:image/png") == 7 and "lens" in text
 
 
-def test_datasets_of_others_and_ours_have_a_page(tmp_path):
-    openh.write(tmp_path / "theirs", "tud-ur5e")
-    about = inspect_command.inspect(str(tmp_path / "theirs"))  # integers among its columns
-    page = tmp_path / "page.html"
-    odd = inspect_page.write(tmp_path / "theirs", "", page, about.rows, about.odd)
-    assert len(odd) == 1 and "depth" in odd[0] and page.read_text().count("data:image/png") == 6
+def test_a_dataset_has_a_page(tmp_path):
     recorded.write(tmp_path / "ours")
+    page = tmp_path / "page.html"
     inspect_page.write(tmp_path / "ours", "", page, [("dataset", "ours")], [])
-    assert page.exists()
-    with mistakes.of("--map", "none"):
-        openh.write(tmp_path / "other", "tud-ur5e")
-        info = tmp_path / "other/meta/info.json"
-        about = json.loads(info.read_text())
-        del about["features"]["action"]
-        info.write_text(json.dumps(about))
-        inspect_page.write(tmp_path / "other", "", page, [], [])
+    assert "data:image/png" in page.read_text()

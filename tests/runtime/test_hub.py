@@ -9,9 +9,7 @@ import mistakes
 import pytest
 import recorded
 
-from starjax.addons.formats.commands import export_command, import_command
 from starjax.commands import inspect_command
-from starjax.data import store
 from starjax.policies import packaged
 from starjax.runtime import hub
 
@@ -53,14 +51,14 @@ def test_a_policy_is_its_file(repositories):
     assert "stardiff" in inspect_command.inspect("hf://me/compact").rows[0][1]
 
 
-def test_a_dataset_goes_out_and_comes_back_by_name(repositories):
-    folder, _ = repositories
-    (folder / "dataset" / "me").mkdir(parents=True)
-    recorded.write(folder / "dataset" / "me" / "ours")
-    out = folder / "dataset" / "me" / "shared"
-    assert export_command.main(["hf://datasets/me/ours", str(out)]) == 0
-    assert import_command.main(["hf://me/shared", str(folder / "back")]) == 0
-    assert store.read_seal(folder / "back") == store.read_seal(folder / "dataset" / "me" / "ours")
+def test_a_dataset_is_its_folder(repositories):
+    folder, asked = repositories
+    ours = folder / "dataset" / "me" / "ours"
+    ours.parent.mkdir(parents=True)
+    recorded.write(ours)
+    assert hub.dataset("PATH", "hf://datasets/me/ours") == ours
+    assert asked == [("dataset", "me/ours", None)]
+    assert "schema" in inspect_command.inspect("hf://datasets/me/ours").rows[0][1]
 
 
 @pytest.mark.parametrize(

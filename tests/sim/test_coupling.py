@@ -8,13 +8,20 @@ import pytest
 
 from starjax.sim import coupling, physics
 from starjax.sim import scene as scenes
+from starjax.sim.tasks.base import Coupling
 
 GRIPPER = -jnp.ones(1)
 
 
 @pytest.fixture(scope="module", params=["psm", "fr5"])
 def scene(request):
-    return scenes.load(scenes.name("needle_drive", [request.param]))
+    """A task whose forces of its own are none, and whose memory counts steps."""
+    made = scenes.load(scenes.name("reach", [request.param], ["needle_driver"]))
+    toy = Coupling(
+        begin=lambda bound, layout, qpos, tips: (qpos, 0),
+        forces=lambda bound, layout, memory, motion: (jnp.zeros_like(motion.qvel), memory + 1),
+    )
+    return made._replace(task=made.task._replace(coupling=toy))
 
 
 def test_tips_and_their_jacobians_are_those_of_mujoco(scene):
@@ -51,15 +58,9 @@ def test_a_task_without_forces_of_its_own_has_neither_forces_nor_memory(scene):
     )
 
 
-def test_the_needle_begins_between_the_jaws(scene):
+def test_memory_begins_at_reset_and_follows_each_step(scene):
     layout = scene.task.sample(scene.bound, jax.random.key(1))
     state = physics.initial(scene, [arm.home for arm in scene.arms], layout)
-    (arm,), data = scene.arms, mujoco.MjData(scene.mj_model)
-    data.qpos[:] = state.qpos
-    mujoco.mj_kinematics(scene.mj_model, data)
-    tip = data.site(scenes.tcp(0, arm.tool)).xpos
-    wires = np.array([data.geom(f"wire{k}").xpos for k in range(7)])
-    # The wire passes the tip: a third from the swage, within a segment.
-    assert np.linalg.norm(wires - tip, axis=1).argmin() == 2
-    assert (np.asarray(physics.openings(scene, state.qpos)) <= -1.0).all()
-    assert state.memory.patches.is_held.all()
+    assert state.memory == 0
+    force, memory = coupling.forces(scene, layout, state, GRIPPER, jnp.asarray(scene.p_world_ref))
+    assert memory == 1 and force.shape == state.qvel.shape

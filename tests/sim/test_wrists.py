@@ -11,6 +11,11 @@ from starjax.sim import registries, scene, wrists
 from starjax.sim.tasks import rescue
 from starjax.types import Agent, Command, Pose
 
+REACH = registries.tasks.get("reach")
+# Of no package, so its wrist is that of the record.
+TASK = REACH._replace(
+    name="bent", slots=tuple(slot._replace(tool="needle_driver") for slot in REACH.slots)
+)
 TROCAR = jnp.array([[0.02, -0.03, 0.15]])
 TIP = Pose(jnp.diag(jnp.array([1.0, -1.0, -1.0]))[None], jnp.array([[-0.02, 0.01, 0.02]]))
 STATE = types.SimpleNamespace(
@@ -25,8 +30,8 @@ def shown(angles):
 
 
 def held(tool, expert):
-    task = registries.tasks.get("needle_regrasp")._replace(experts={"shown": expert})
-    return wrists.holding(task, scene.name("needle_regrasp", ["psm"], [tool]))
+    task = TASK._replace(experts={"shown": expert})
+    return wrists.holding(task, scene.name("reach", ["psm"], [tool]))
 
 
 @pytest.mark.parametrize("part", (0, 2))
@@ -45,10 +50,8 @@ def test_straight_commands_and_the_tasks_own_tool_leave_an_expert_as_it_is():
     assert straight.wrist is None and straight.pose is TIP
     own = shown(jnp.zeros((1, 2)))
     assert held("needle_driver", own).experts["shown"] is own
-    module = registries.tasks.get("needle_regrasp").experts["default"].partition(":")[0]
-    task = wrists.holding(
-        registries.tasks.get("needle_regrasp"), scene.name("needle_regrasp", ["psm"], ["prograsp"])
-    )
+    module = TASK.experts["default"].partition(":")[0]
+    task = wrists.holding(TASK, scene.name("reach", ["psm"], ["prograsp"]))
     assert getattr(task.experts["default"], "__module__", "") == module
 
 
@@ -57,11 +60,10 @@ def test_an_expert_that_takes_over_bends_the_wrist_of_the_tool_at_hand(monkeypat
     agent = shown(angles)()
     written = rescue.Rescuer(agent.init, agent.act)
     monkeypatch.setattr(registries, "rescuers", types.SimpleNamespace(get=lambda name: written))
-    own = registries.tasks.get("needle_regrasp")
-    assert wrists.rescuer(own, "needle_regrasp") is written
-    task = wrists.holding(own, scene.name("needle_regrasp", ["psm"], ["prograsp"]))
-    fitted = wrists.rescuer(task, "needle_regrasp")
-    assert wrists.rescuer(task, "needle_regrasp") is fitted  # else every round would compile
+    assert wrists.rescuer(TASK, "bent") is written
+    task = wrists.holding(TASK, scene.name("reach", ["psm"], ["prograsp"]))
+    fitted = wrists.rescuer(task, "bent")
+    assert wrists.rescuer(task, "bent") is fitted  # else every round would compile
     command = fitted.act((), STATE)[0]
     shaft = rcm.shaft_of(rcm.PROGRASP, command.pose, command.wrist)
     np.testing.assert_allclose(rcm.rcm_error(shaft, TROCAR), 0.0, atol=1e-6)

@@ -57,7 +57,7 @@ def test_it_is_found_in_both_kinds_of_policy(tmp_path, method):
 
 def test_a_packaged_policy_is_known_by_its_name_or_its_path(source, tmp_path, monkeypatch):
     path, params = source
-    monkeypatch.setattr(packaged, "FOLDER", tmp_path)
+    monkeypatch.setattr(packaged, "folders", lambda: [tmp_path])
     policy_file.save(tmp_path / "compact.safetensors", policy_file.load(path), half=True)
     named = settings("compact", freeze_encoder=True)
     found = encoder.read(named)

@@ -89,11 +89,8 @@ def inspect(name: str) -> Found:
     elif path.suffix == ".json" or (path / "result.json").is_file():
         look = _result
     elif (look := extensions.hook("inspect")) is None:
-        expected, hint = (
-            "a dataset of starjax, a policy or a result",
-            "others need the add-on formats",
-        )
-        raise errors.UsageError("PATH", expected, name, f"{hint}, which is absent here")
+        expected = "a dataset of starjax, a policy or a result"
+        raise errors.UsageError("PATH", expected, name, "others need the add-on formats")
     try:
         return look(path)
     except (ValueError, KeyError) as error:

@@ -128,7 +128,7 @@ def _preset(preset: RunConfig) -> str:
 
 def _policies() -> Iterator[Row]:
     for name in packaged.names():
-        about = files.read_json(packaged.FOLDER / f"{name}.json")
+        about = files.read_json(packaged.locate(name).with_suffix(".json"))
         label = methods.METHODS[about["method"]].label
         scores = ", ".join(
             f"{part} {about[part]['successes']}/{about[part]['trials']}"

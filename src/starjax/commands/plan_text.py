@@ -175,7 +175,7 @@ def _scene_of(encoder_weights: str) -> Any:
     from starjax.policies import packaged, policy_file
 
     try:
-        return policy_file.load(packaged.locate(encoder_weights)).scene
+        return policy_file.load(packaged.find_encoder("", encoder_weights)).scene
     except (OSError, ValueError):
         return None
 

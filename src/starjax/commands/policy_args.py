@@ -118,7 +118,7 @@ def _address_label(address: str) -> str:
 
 def label(file: Path) -> str:
     """Returns a name for a file of weights: its stem or directory plus eight digits of its hash."""
-    if file.parent == packaged.FOLDER:
+    if packaged.is_packaged(file):
         return file.stem
     name = file.stem if file.stem != "policy" else file.resolve().parent.name
     return f"{name}-{files.sha256(file)[:8]}"

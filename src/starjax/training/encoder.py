@@ -36,7 +36,7 @@ def read(policy_config: config.PolicyConfig) -> Encoder | None:
       errors.UsageError: the file is missing or damaged, or its encoder differs from the settings.
     """
     name = policy_config.encoder_weights
-    path = packaged.find(_WEIGHTS, name)
+    path = packaged.find_encoder(_WEIGHTS, name)
     if not policy_file.is_policy(path):
         _check_resnet18(policy_config, path)
         return None

@@ -47,6 +47,14 @@ def test_out_and_back(root, exported, tmp_path, capsys):
     assert "4 demonstrations" in capsys.readouterr().out
 
 
+def test_a_dataset_goes_out_and_comes_back_by_its_name_on_the_hub(root, tmp_path, monkeypatch):
+    monkeypatch.setattr("starjax.runtime.hub.dataset", lambda argument, name: tmp_path / name[5:])
+    shutil.copytree(root, tmp_path / "ours")
+    assert export_command.main(["hf://ours", str(tmp_path / "shared")]) == 0
+    assert import_command.main(["hf://shared", str(tmp_path / "back")]) == 0
+    assert store.read_seal(tmp_path / "back") == store.read_seal(root)
+
+
 def test_a_mapping_makes_a_dataset_of_a_strangers(exported, tmp_path, capsys):
     (tmp_path / "map.toml").write_text(MAP)
     argv = [str(exported), str(tmp_path / "d"), "--map", str(tmp_path / "map.toml")]

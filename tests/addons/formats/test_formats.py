@@ -1,5 +1,6 @@
 """Exports and imports: back as they were, with the columns that peers expect, whatever happens."""
 
+import importlib.metadata
 import json
 import shutil
 from typing import Any
@@ -447,3 +448,13 @@ def test_failures_come_last_and_are_restored_in_their_order(tmp_path, name):
         assert splits == {"train": "0:3", "failure": "3:4"}
     assert restore(out, tmp_path / "back")["same"]
     assert kill.tree(tmp_path / "back") == kill.tree(tmp_path / "d")
+
+
+def test_a_broken_format_leaves_the_others(tmp_path, monkeypatch):
+    broken = importlib.metadata.EntryPoint("notes", "nowhere_at_all:FORMAT", "starjax.formats")
+    monkeypatch.setattr(type(base.FORMATS), "_entries", lambda self: [broken])
+    (tmp_path / "d" / "meta").mkdir(parents=True)
+    (tmp_path / "d" / "meta" / "info.json").touch()
+    assert base.detect(tmp_path / "d") == "lerobot"
+    with pytest.warns(UserWarning, match="skipped"), pytest.raises(errors.UsageError):
+        base.detect(tmp_path)  # of no format: the broken ones are asked too

@@ -6,6 +6,7 @@ import pytest
 
 from starjax.addons.viewer import meshes, stage
 from starjax.sim import scene
+from starjax.types import Pose
 
 ROUND = ("mjGEOM_SPHERE", "mjGEOM_CAPSULE", "mjGEOM_CYLINDER", "mjGEOM_BOX", "mjGEOM_ELLIPSOID")
 
@@ -86,6 +87,22 @@ class Scene:
 
     def add_line_segments(self, *given, **more):
         return type("Handle", (), {})()
+
+
+def test_a_trocar_a_body_at_rest_and_a_thread_are_where_they_are_set():
+    made = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody>
+        <geom name="thread0" type="capsule" size="0.001 0.01" contype="0" conaffinity="0"/>
+        <body name="trocar0" mocap="true"><geom name="trocar0" size="0.01"/></body>
+        <body name="still0" mocap="true"><geom name="mark" size="0.01"/></body>
+        </worldbody></mujoco>"""
+    )
+    trocar, mark = np.array([[0.0, 0.0, 0.15]]), np.array([[0.03, 0.0, 0.01]])
+    points = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, 0.0]])
+    geoms = stage.kinematics(made)(points.ravel(), trocar, Pose(np.eye(3)[None], mark))
+    for name, p in (("trocar0", trocar[0]), ("mark", mark[0]), ("thread0", points.mean(0))):
+        np.testing.assert_allclose(geoms.p[made.geom(name).id], p, atol=1e-7)
+    np.testing.assert_allclose(geoms.R[made.geom("thread0").id, :, 2], [1.0, 0.0, 0.0], atol=1e-7)
 
 
 def test_instances_follow_the_simulation(model):

@@ -5,6 +5,7 @@ from starjax.extensions import AddOn
 _HERE = "starjax.addons.suture"
 TABLE = AddOn(
     "needles with a wrist through tissue, with a thread",
+    policies=("needle_drive",),
     parts={
         "task": {
             "needle_regrasp": f"{_HERE}.needle_regrasp.task:TASK",

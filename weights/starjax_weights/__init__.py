@@ -1,0 +1,1 @@
+"""Trained policies and runtime monitors of starjax, found by `starjax.policies.packaged`."""
