@@ -63,19 +63,13 @@ def score(
     return {
         "seed": seed,
         "expert": TASKS[task],
-        "twelve": _summary(episodes, slice(own), env.control_hz),
-        "eq19": _summary(episodes, slice(own, None), env.control_hz),
+        "twelve": runs.summary(runs.part(episodes, slice(own)), env),
+        "eq19": runs.summary(runs.part(episodes, slice(own, None)), env),
     }
 
 
 def _run(env: envs.Env, agent: Agent, trocars: rcm.Trocar, key: jax.Array) -> runs.ExpertEpisodes:
     return runs.run(env, agent, trocars, key, max(STEPS, env.task.least_steps))
-
-
-def _summary(episodes: runs.ExpertEpisodes, rows: slice, control_hz: float) -> dict[str, Any]:
-    wall_s = episodes.wall_s
-    part = jax.tree.map(lambda leaf: leaf[rows], episodes._replace(wall_s=None))
-    return runs.summary(part._replace(wall_s=wall_s), control_hz)
 
 
 if __name__ == "__main__":

@@ -125,7 +125,7 @@ def turning(theta: Any, grasp: Any) -> Pose:
 def path() -> np.ndarray:
     """The point's angle `[T]` rad at each control step: at rest, the arc, at rest."""
     steps = np.arange(round((LEAD + SECONDS + REST) * CONTROL_HZ)) / CONTROL_HZ
-    fraction = scripting.minimum_jerk(np.clip((steps - LEAD) / SECONDS, 0.0, 1.0))
+    fraction = scripting.sloped(np.clip((steps - LEAD) / SECONDS, 0.0, 1.0))
     return np.asarray(SWEEP[0] + fraction * np.ptp(SWEEP), np.float32)
 
 

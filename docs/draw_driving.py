@@ -32,7 +32,7 @@ def driven(aside: jax.Array) -> tuple[prescribed.DriveMoment, jax.Array]:
     half, held = needles.entry_angle(SIZE, BITE), grasps.grasp(SIZE)
 
     def tip_at(share: jax.Array) -> tuple[Pose, jax.Array]:
-        share = scripting.minimum_jerk(share)
+        share = scripting.sloped(share)
         turn = -half - BEFORE + share * (2.0 * half + BEFORE + AFTER)
         needle = needles.pose_on(SIZE, BITE, turn)
         R = needle.R @ held.R.T

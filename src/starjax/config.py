@@ -132,6 +132,9 @@ class TrainConfig:
     log_every: Count = 100  # training steps between lines of metrics.jsonl
     # control steps between the windows of a demonstration; 1 trains on all of them
     window_stride: Count = 1
+    # skips windows that begin among at least so many commands without motion, where a policy may
+    # learn to wait; 0: none
+    skip_still: CountOrZero = 0
     # demonstrations held out to measure the action error
     holdout_demos: CountOrZero = 8
 

@@ -42,6 +42,9 @@ class EvaluateArgs(benchmark_args.BenchmarkArgs, policy_args.PolicyArgs):
     # options of the learner instead of those of the training, such as temperature=0.1 or onestep's
     # correct_at=0.3
     sampling: tuple[str, ...] = ()
+    # executed commands of a plan instead of those of the training, 0 for these. Success that falls
+    # with fewer means that the policy waits where its demonstrations stood still
+    execute: config_lib.CountOrZero = 0
     out: str = options.AUTO  # directory of the result; auto: one in RUN or in runs/evaluate
     video: bool = True  # write rollout.mp4
     eval: config_lib.EvalConfig = dataclasses.field(default_factory=config_lib.EvalConfig)
@@ -98,12 +101,16 @@ def _parse(argv: Sequence[str], has_gpu: bool) -> tuple[EvaluateArgs, policy_arg
     if args.video:
         extras.require("evaluate --video", "report", "video")
     benchmark_args.check(args, default)
-    path = policy_args.resolve(args)._replace(sampling=policy_args.sampling(args.sampling))
-    if path.address and args.sampling:
-        raise errors.UsageError(policy_args.SAMPLING, "a file's policy", path.address)
+    path = policy_args.resolve(args)._replace(
+        sampling=policy_args.sampling(args.sampling), execute=args.execute
+    )
+    if path.address and (args.sampling or args.execute):
+        flag = policy_args.SAMPLING if args.sampling else "--execute"
+        raise errors.UsageError(flag, "a file's policy", path.address)
     trials = f"seed{args.seed}-{args.eval.trials}x{args.eval.time_limit_s:g}s"
     trials = benchmark_args.label() if args.benchmark else trials
     samples = [word.replace("=", "") for word in args.sampling]
+    samples += [f"execute{args.execute}"] * bool(args.execute)
     parts = [*samples, trials, *["ensemble"] * args.eval.ensemble]
     return args, path, path.folder("evaluate", parts, args.out)
 

@@ -100,7 +100,7 @@ def inspect(name: str) -> Found:
 
 
 def _dataset(path: Path) -> Found:
-    from starjax.data import anomalies, store
+    from starjax.data import anomalies, stillness, store
 
     about = store.read_description(path)
     scene, keys = about["scene"], store.keys(path)
@@ -118,6 +118,7 @@ def _dataset(path: Path) -> Found:
         ("kept", f"{len(kept)}, {sum(lengths)} frames, {files.size(size)}"),
         ("lengths", spread(lengths, " control steps")),
         ("trocars", f"{len({r['trocar'] for r in kept})} used of {len(about['trocars'])}"),
+        ("rests", stillness.text(stillness.of_records(path, kept))),
         ("from", "import" if "imported" in about else f"expert {about['expert']}"),
     ]
     rows += [

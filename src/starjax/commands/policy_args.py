@@ -41,6 +41,7 @@ class PolicyPath(NamedTuple):
       arms: robots instead of those of the training.
       address: of a server instead of a file, else empty.
       sampling: option of the policy's learner -> value instead of that of the training.
+      execute: commands of a plan to execute instead of those of the training; 0: the same.
     """
 
     file: Path
@@ -48,6 +49,7 @@ class PolicyPath(NamedTuple):
     arms: tuple[str, ...] = ()
     address: str = ""
     sampling: Mapping[str, Any] = MappingProxyType({})
+    execute: int = 0
 
     def folder(self, command: str, parts: Sequence[str], out: str = options.AUTO) -> Path:
         """Returns the directory of a command's results.
@@ -147,6 +149,12 @@ def load(path: PolicyPath) -> tuple[Any, config_lib.RunConfig]:
         return who, _settings(who.trained)
     read = in_env.read if path.run is None else policy_evaluation.read
     trained = samples.applied(SAMPLING, read(path.file), path.sampling)
+    if path.execute:
+        most, argument = trained.policy.horizon, "--execute"
+        checks.expect(path.execute <= most, argument, f"at most {most}, a plan", path.execute)
+        policy = dataclasses.replace(trained.policy, execute=path.execute)
+        # A monitor is calibrated for the training's plans.
+        trained = trained._replace(policy=policy, monitor=None)
     method = path.run.name if path.run else ""
     who = in_env.place_in_own_scene(path.file, trained, method=method, arms=path.arms)
     if path.run is None:

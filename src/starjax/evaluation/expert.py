@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
+from starjax.data import stillness
 from starjax.evaluation import statistics
 from starjax.sim import collision, dynamics, ik, physics
 from starjax.sim import env as envs
@@ -33,6 +34,7 @@ class ExpertEpisodes(NamedTuple):
       command: executed in the last step.
       at_collision: EnvState after the first step that collided, else the initial one.
       errors: `[N, T]` m, executed RCM error of the arm that is farthest off.
+      still: `[N, T]` bool, the command to record is nearly that of the step before.
       finite: `[N]` bool, the task's state was finite at every step.
       wall_s: s to compile and run.
     """
@@ -41,6 +43,7 @@ class ExpertEpisodes(NamedTuple):
     command: Command
     at_collision: EnvState
     errors: np.ndarray
+    still: np.ndarray
     finite: np.ndarray
     wall_s: float
 
@@ -63,10 +66,34 @@ def run(
     return ExpertEpisodes(*joined, wall_s=time.perf_counter() - start)
 
 
-def summary(episodes: ExpertEpisodes, control_hz: float) -> dict[str, Any]:
-    """Returns counts, the success rate with its 95 % interval, times and RCM errors."""
+def part(episodes: ExpertEpisodes, rows: slice) -> ExpertEpisodes:
+    """Returns some of the episodes."""
+    wall_s = episodes.wall_s
+    some = jax.tree.map(lambda leaf: leaf[rows], episodes._replace(wall_s=None))
+    return some._replace(wall_s=wall_s)
+
+
+def longest_rests(episodes: ExpertEpisodes, settle_steps: int) -> np.ndarray:
+    """Returns `[M]`, the longest still stretch of each success, in control steps.
+
+    The last `settle_steps` do not count: there the task is done, and its judge waits. A task that
+    settles in one step judges whole episodes: its tool may rest with an object that it follows.
+    """
+    ends = np.asarray(episodes.last.step) * (settle_steps > 1) - settle_steps
+    return np.array(
+        [
+            stillness.stretches(episodes.still[i, : max(ends[i], 0)]).max(initial=0)
+            for i in np.flatnonzero(episodes.last.success)
+        ],
+        int,
+    )
+
+
+def summary(episodes: ExpertEpisodes, env: envs.Env) -> dict[str, Any]:
+    """Returns counts, the success rate with its 95 % interval, times, stillness and RCM errors."""
     last, steps = episodes.last, episodes.errors.shape[1]
     count, success = len(last.success), np.asarray(last.success)
+    rests = longest_rests(episodes, env.task.settle_steps)
     low, high = statistics.wilson(int(success.sum()), count)
     executed = episodes.errors[np.arange(steps) < np.asarray(last.step)[:, None]] * 1e3
     return {
@@ -77,7 +104,9 @@ def summary(episodes: ExpertEpisodes, control_hz: float) -> dict[str, Any]:
         "collided": int(last.collided.sum()),
         "collided_successes": int((last.collided & success).sum()),
         "invalid": int(last.invalid.sum()),
-        "median_transfer_s": float(np.median(last.step[success])) / control_hz,
+        "median_transfer_s": float(np.median(last.step[success])) / env.control_hz,
+        "longest_rest": int(rests.max(initial=0)),
+        "resting": int((rests > stillness.MOST).sum()),
         "rcm_error_mm": {
             "mean": float(executed.mean()),
             "p99": float(np.quantile(executed, 0.99)),
@@ -140,32 +169,33 @@ def _pairs(scene: scenes.Scene, state: EnvState) -> dict[str, jax.Array]:
 
 def _episode(
     env: envs.Env, agent: Agent, key: jax.Array, trocar: rcm.Trocar, steps: int
-) -> tuple[EnvState, Command, EnvState, jax.Array, jax.Array]:
+) -> tuple[EnvState, Command, EnvState, jax.Array, jax.Array, jax.Array]:
     key_reset, key_expert = jax.random.split(key)
     first = env.reset(key_reset, envs.EnvParams(trocar))
 
     def step(carry: Any) -> Any:
-        state, memory, _, hit, largest, finite = carry
-        command, memory, _ = agent.act(memory, state)
+        state, memory, _, hit, largest, before, still, finite = carry
+        command, memory, label = agent.act(memory, state)
         after = env.step(state, command)
         is_first = after.collided & ~state.collided
         hit = jax.tree.map(lambda new, old: jnp.where(is_first, new, old), after, hit)
         largest = largest.at[state.step].set(jnp.max(after.rcm_error))
-        return after, memory, command, hit, largest, finite & _is_finite(env, after)
+        still = still.at[state.step].set(stillness.is_still(before, label))
+        return after, memory, command, hit, largest, label, still, finite & _is_finite(env, after)
 
     memory = agent.init(key_expert, first)
     has_angles = jax.eval_shape(agent.act, memory, first)[0].wrist is not None
     hold = Command(first.pose, first.gripper, first.wrist if has_angles else None)
     start = (
         *(first, memory, hold, first),
-        *(jnp.zeros(steps), _is_finite(env, first)),
+        *(jnp.zeros(steps), hold, jnp.zeros(steps, bool), _is_finite(env, first)),
     )
-    state, _, command, hit, largest, finite = jax.lax.while_loop(
+    state, _, command, hit, largest, _, still, finite = jax.lax.while_loop(
         lambda carry: ~carry[0].done & (carry[0].step < steps), step, start
     )
     # Memories of disturbances hold keys, which no array on the host can.
     state, hit = (one.replace(wrapper_state={}) for one in (state, hit))
-    return state, command, hit, largest, finite
+    return state, command, hit, largest, still, finite
 
 
 def _is_finite(env: envs.Env, state: EnvState) -> jax.Array:

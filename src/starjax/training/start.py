@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from starjax import config, methods
-from starjax.data import normalizer, windows
+from starjax.data import normalizer, stillness, windows
 from starjax.policies import policy as policies
 from starjax.sim.tasks.base import Task
 from starjax.training import encoder
@@ -41,6 +41,7 @@ def fitted(
     )
     row = policies.ablated(method, policy_config)
     stats = normalizer.fit(row, task, dataset, frames)
+    frames = stillness.skipped(dataset, frames, train_config.skip_still)
     frames, held_out = (
         windows.strided(dataset, kept, train_config.window_stride) for kept in (frames, held_out)
     )

@@ -73,6 +73,6 @@ def test_the_expert_of_peg_transfer_continues_a_demonstration(found, bench_takeo
 def test_a_motion_goes_on_at_its_speed(speed):
     left, duration = 0.012, 1.1
     at = float(midway.share(jnp.float32(left), jnp.float32(speed), jnp.float32(duration)))
-    way = left / (1.0 - scripting.minimum_jerk(at))
-    slope = jax.grad(scripting.minimum_jerk)(at)
+    way = left / (1.0 - scripting.sloped(at))
+    slope = jax.grad(scripting.sloped)(at)
     np.testing.assert_allclose(way * slope / duration, speed, rtol=0.01, atol=1e-6)

@@ -15,7 +15,7 @@ from starjax.addons.suture.needle_drive import task as driven
 from starjax.addons.suture.suture_throw import expert, far_grasp, rescue, task
 from starjax.addons.suture.tissue import needle as needles
 from starjax.sim import physics, scene
-from starjax.sim.tasks import scripting, wrist_script
+from starjax.sim.tasks import wrist_script
 from starjax.sim.tasks.base import SimReadings
 from starjax.types import Pose
 
@@ -189,18 +189,6 @@ def test_a_needle_that_was_let_go_inside_is_taken_as_for_driving_and_driven_on(s
     assert following(expert.BACK, no) == expert.APPROACH
     assert following(expert.CLOSE, yes) == expert.DRIVE
     assert following(expert.CLOSE, no) == expert.APPROACH
-
-
-def test_a_sloped_way_begins_and_ends_at_rest_and_waits_less_than_minimum_jerk():
-    s = np.linspace(0.0, 1.0, 1001)
-    done = np.asarray(scripting.sloped(jnp.asarray(s), expert.SLOPE))
-    speed = np.gradient(done, s)
-    np.testing.assert_allclose(done[[0, 500, -1]], [0.0, 0.5, 1.0], atol=1e-6)
-    assert speed.min() > -1e-3 and max(speed[0], speed[-1]) < 0.01
-    inner = (s > expert.SLOPE + 0.01) & (s < 0.99 - expert.SLOPE)
-    np.testing.assert_allclose(speed[inner], 1.0 / (1.0 - expert.SLOPE), rtol=1e-3)
-    near = np.asarray(scripting.minimum_jerk(jnp.asarray(s))) > 0.99
-    assert (done > 0.99).sum() < 0.6 * near.sum()
 
 
 def test_jaws_close_off_the_recorded_grasp_and_the_next_way_begins_there(start):

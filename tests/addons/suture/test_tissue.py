@@ -121,7 +121,7 @@ def driven(aside=0.0, gripper=-1.0):
 
     def tip_at(t):
         s = jnp.clip(t / 4.0, 0.0, 1.0)
-        s = scripting.minimum_jerk(s)
+        s = scripting.sloped(s)
         needle = needles.pose_on(SIZE, BITE, -half - 0.2 + s * (2 * half + 0.5))
         R = needle.R @ held.R.T
         return Pose(R, needle.p - R @ held.p + s * jnp.array([0.0, aside, 0.0]))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from starjax import rcm
+from starjax.data import stillness
 from starjax.sim import assets, mjcf_parts, registries, scene
 from starjax.sim import env as envs
 from starjax.sim.tasks.needle_pick import task as needle
@@ -84,12 +85,13 @@ def test_the_expert_of_a_task_succeeds(name):
     @jax.jit
     @jax.vmap
     def drive(state, memory):
-        command, memory, _ = agent.act(memory, state)
-        return environment.step(state, command), memory
+        command, memory, label = agent.act(memory, state)
+        return environment.step(state, command), memory, label
 
-    looks = []
+    looks, labels = [], []
     for step in range(EXPERTS[name]):
-        state, memory = drive(state, memory)
+        state, memory, label = drive(state, memory)
+        labels.append(label)
         looks += [] if step % LOOKS else [state.physics.qpos]
         assert ((state.reward >= 0) & (state.reward <= 1)).all()
         assert (state.stage >= 0).all() and (state.stage < len(task.stages)).all()
@@ -99,6 +101,11 @@ def test_the_expert_of_a_task_succeeds(name):
     assert won.sum() >= LANES - DROPS.get(name, 0) and not state.invalid.any()
     assert (np.asarray(state.reward)[won] == 1.0).all()
     assert float(state.rcm_error_within[won].max()) < 0.5e-3
+    commands = jax.tree.map(lambda *steps: np.stack(steps, 1), *labels)
+    for lane in np.flatnonzero(won & (task.settle_steps > 1)):  # else it follows an object
+        before = int(state.step[lane]) - task.settle_steps
+        moves = jax.tree.map(lambda x, n=lane, end=before: x[n, :end], commands)
+        assert stillness.stretches(stillness.still_steps(moves)).max(initial=0) <= stillness.MOST
     fields = jax.vmap(environment.observe)(state).state
     assert fields is not None and fields.shape == (LANES, task.state_size)
     asked = contacts.asked(environment.scene, looks, state.trocar.p_world_trocar)

@@ -17,6 +17,10 @@ _LOOKED_AT = 50  # episodes of a foreign dataset whose values are read
 
 
 def summary(path: Path) -> Found:
+    import numpy as np
+
+    from starjax.data import stillness
+
     name = base.detect(path)
     with base.open_dataset(path, name) as source:
         lengths = sorted(source.lengths)
@@ -33,6 +37,8 @@ def summary(path: Path) -> Found:
         low = [column for column, about in source.columns.items() if not about.is_image]
         ranges = {column: _Numbers() for column in low}
         unread, timed = [], []
+        actions = [c for c in low if "action" in c and source.columns[c].dtype.startswith("float")]
+        rests = []
         for episode in range(min(len(lengths), _LOOKED_AT)):  # one at a time in memory
             try:
                 arrays = source.read(episode, low)
@@ -43,6 +49,10 @@ def summary(path: Path) -> Found:
                 ranges[column].add(episode, values)
             odd = timing.anomalies(source, episode, arrays)
             timed += [f"episode {episode}: {line}" for line in odd]
+            if actions:
+                flat = [arrays[c].reshape(len(arrays[c]), -1) for c in actions]
+                rests.append(stillness.of_numbers(np.concatenate(flat, axis=-1)))
+        rows.append(("rests", stillness.text(rests)))
         rows += [
             (f"  {column}", _said(about, ranges.get(column)))
             for column, about in source.columns.items()

@@ -10,6 +10,7 @@ import numpy as np
 
 from starjax import config, errors, rcm
 from starjax.commands.part_checks.base import FAILED, NOTE, Check, attempt, counted, failed, verdict
+from starjax.data import stillness
 from starjax.evaluation import expert as episodes
 from starjax.rollouts.success_quota import MIN_SUCCESS_RATE
 from starjax.sim import contract, coupling, physics, registries, sampling, task_draws
@@ -165,7 +166,7 @@ def _expert(env: envs.Env, variant: str, n: int) -> Iterator[Check]:
 
 def _outcomes(env: envs.Env, subject: str, ran: episodes.ExpertEpisodes) -> Iterator[Check]:
     last, success = ran.last, np.asarray(ran.last.success)
-    figures, count = episodes.summary(ran, env.control_hz), len(success)
+    figures, count = episodes.summary(ran, env), len(success)
     text = f"{success.sum()} of {count} succeed"
     if success.any():
         text += f", in {figures['median_transfer_s']:.1f} s"
@@ -178,6 +179,13 @@ def _outcomes(env: envs.Env, subject: str, ran: episodes.ExpertEpisodes) -> Iter
         yield Check(subject, text)
     if late:
         yield Check(subject, f"{late} take more than --demos.max-steps {usual}", NOTE)
+    if figures["resting"] > stillness.RARELY * success.sum():
+        text = (
+            f"stands still for up to {figures['longest_rest']} control steps, in "
+            f"{figures['resting']} of {success.sum()} successes for more than {stillness.MOST}: a "
+            "policy waits there; end phases by events"
+        )
+        yield failed(subject, text)
     if not ran.finite.all():
         yield failed(subject, f"{_fields(env, ran)} in {int((~ran.finite).sum())} episodes")
     waiting = ~(success | last.lost | last.invalid)

@@ -62,7 +62,7 @@ class Play(NamedTuple):
 
     Attributes:
       choose: (key, EnvState) -> (key, tempo, held), the draws at the start.
-      duration: `[P]` s at tempo 1.
+      duration: `[P]` s at tempo 1; 0 where jaws move, see `scripting.is_of_jaws`.
       jaws: `[P, 2]`, at the end of each phase.
       aligned: `[P]`, fraction of a phase after which a tool goes straight down.
       turned: `[P]`, fraction of a phase after which a tool has turned.
@@ -122,18 +122,20 @@ def _act(
     play: Play, script: HandoverScript, state: EnvState
 ) -> tuple[Command, HandoverScript, Command]:
     """Returns the disturbed commands to execute, the script, and the undisturbed ones to record."""
+    is_of_jaws = jnp.asarray(scripting.is_of_jaws(play.jaws))[script.phase]
+    target = jnp.asarray(play.jaws, jnp.float32)[script.phase]
     is_over = script.elapsed >= script.duration - 1e-6
+    is_over |= is_of_jaws & scripting.have_arrived(target, state)
     after = _enter(play, script, play.following(script, state), state)
     script = jax.tree.map(lambda a, b: jnp.where(is_over, a, b), after, script)
     elapsed = script.elapsed + 1.0 / CONTROL_HZ
-    nominal = jnp.asarray(play.duration, jnp.float32)[script.phase]
-    s = jnp.clip(elapsed * script.tempo / nominal, 0.0, 1.0)
+    s = jnp.clip(elapsed / script.duration, 0.0, 1.0)
     # On the way down a tool is above its goal before anything can touch.
     aside, turned = (
-        scripting.minimum_jerk(jnp.minimum(s / jnp.asarray(at, jnp.float32)[script.phase], 1.0))
+        scripting.sloped(jnp.minimum(s / jnp.asarray(at, jnp.float32)[script.phase], 1.0))
         for at in (play.aligned, play.turned)
     )
-    fraction = scripting.minimum_jerk(s)
+    fraction = scripting.sloped(s)
     deviation = jnp.array(DEVIATION * 2)
     noise = scripting.disturb(script.key, script.noise, state.step, deviation)
     target = jnp.asarray(play.jaws, jnp.float32)[script.phase]
@@ -156,10 +158,13 @@ def _enter(play: Play, script: HandoverScript, phase: jax.Array, state: EnvState
     goal = goals[phase]
     normals = jnp.where(jnp.asarray(play.looks)[phase][:, None], normal, script.normal)
     at_zero = play.command(jnp.zeros(2), goal, script.jaws, state).pose.R
+    is_of_jaws = jnp.asarray(scripting.is_of_jaws(play.jaws))[phase]
+    limit = scripting.jaw_limit(script.jaws, jnp.asarray(play.jaws, jnp.float32)[phase])
+    duration = jnp.asarray(play.duration, jnp.float32)[phase] / script.tempo
     return script.replace(
         phase=phase,
         elapsed=jnp.zeros(()),
-        duration=jnp.asarray(play.duration, jnp.float32)[phase] / script.tempo,
+        duration=jnp.where(is_of_jaws, limit, duration),
         start=script.p,
         goal=goal,
         normal=normals,

@@ -1,4 +1,4 @@
-"""State machine of the one-arm scripts: each phase is a motion to a goal, at least so long.
+"""State machine of the one-arm scripts: each phase is a motion to a goal, or one of the jaws.
 
 A phase's goal is set from the state at its start. The tool rises, approaches and descends; the
 other phases are the task's own. A `Grasp` is the machine of scripts that grasp along a normal.
@@ -22,6 +22,9 @@ RAISE, APPROACH, DESCEND = range(3)  # the first phases of every script
 ALIGNED = 0.6  # fraction of a descent after which the tool goes straight down
 TURN_LEAD = 0.25  # s before the end of the approach at which the tool begins to turn
 TURN_TIME = 0.80  # s the turn takes
+# m that a tool rises on slowly in a second while the judge waits, so that it never stands still
+RISE = 0.004
+RISEN = 0.0005  # m below its height, from which a tool has risen
 
 
 @flax.struct.dataclass
@@ -77,7 +80,7 @@ class PhaseTable(NamedTuple):
     """Phases P.
 
     Attributes:
-      duration: `[P]` s, the least one.
+      duration: `[P]` s, the least one; 0 where jaws move, see `scripting.is_of_jaws`.
       speed: `[P]` m/s, the mean one.
       jaws: `[P]`, at the end: +1 open, -1 closed.
       tempo: range of an episode's pace.
@@ -153,11 +156,17 @@ def enter(
     """Returns the script at the start of `phase`, whose goal is that of `goals` `[P]`."""
     goal = jnp.stack(goals)[phase]
     length = jnp.linalg.norm(goal[-3:] - script.at[-3:])
-    duration, speed = (jnp.asarray(rows)[phase] for rows in (timing.duration, timing.speed))
+    least, speed, jaws = (
+        jnp.asarray(rows)[phase] for rows in (timing.duration, timing.speed, timing.jaws)
+    )
+    duration = jnp.maximum(least, length / speed) / script.tempo
+    # A tool that is high already does not wait for the time of a rise.
+    duration = jnp.where((phase == RAISE) & (length < RISEN), 0.0, duration)
+    is_of_jaws = jnp.asarray(scripting.is_of_jaws(timing.jaws))[phase]
     return script.replace(
         phase=phase,
         elapsed=jnp.zeros(()),
-        duration=jnp.maximum(duration, length / speed) / script.tempo,
+        duration=jnp.where(is_of_jaws, scripting.jaw_limit(script.jaws, jaws), duration),
         start=script.at,
         goal=goal,
         jaws_from=script.jaws,
@@ -165,12 +174,17 @@ def enter(
     )
 
 
-def advance(script: ScriptT, timing: PhaseTable, after: ScriptT) -> tuple[ScriptT, jax.Array]:
+def advance(
+    script: ScriptT, timing: PhaseTable, after: ScriptT, state: EnvState
+) -> tuple[ScriptT, jax.Array]:
     """Returns the script a control step later, `after` if its phase is over, and the time's share.
 
     Jaws are those of the new step; the position is the caller's to set.
     """
+    is_of_jaws = jnp.asarray(scripting.is_of_jaws(timing.jaws))[script.phase]
+    target = jnp.asarray(timing.jaws)[script.phase]
     is_over = script.elapsed >= script.duration - 1e-6
+    is_over |= is_of_jaws & scripting.have_arrived(target, state)
     script = jax.tree.map(lambda a, b: jnp.where(is_over, a, b), after, script)
     elapsed = script.elapsed + 1.0 / CONTROL_HZ
     jaws = scripting.jaws(script.jaws_from, jnp.asarray(timing.jaws)[script.phase], elapsed)
@@ -194,12 +208,12 @@ def agent(init: Callable[[jax.Array, EnvState], Any], grasp: Grasp) -> Agent:
 
     def act(script: GraspT, state: EnvState) -> tuple[Command, GraspT, Command]:
         after = grasp.enter(script, grasp.following(script, state), state)
-        script, s = advance(script, grasp.timing, after)
+        script, s = advance(script, grasp.timing, after, state)
         # On the way down it is above its goal before anything can touch.
         is_straight = functools.reduce(operator.or_, (script.phase == p for p in grasp.straight))
         aligned = jnp.where(is_straight, ALIGNED, 1.0)
-        aside = scripting.minimum_jerk(jnp.minimum(s / aligned, 1.0))
-        fraction = jnp.stack([aside, aside, scripting.minimum_jerk(s)])
+        aside = scripting.sloped(jnp.minimum(s / aligned, 1.0))
+        fraction = jnp.stack([aside, aside, scripting.sloped(s)])
         script = script.replace(at=script.start + fraction * (script.goal - script.start))
         deviation = jnp.array(grasp.deviation)
         noise = scripting.disturb(script.key, script.noise, state.step, deviation)

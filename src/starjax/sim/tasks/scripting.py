@@ -1,7 +1,12 @@
-"""Common parts of scripted experts: smooth motion, jaws, rolls, and a disturbance to correct."""
+"""Common parts of scripted experts: smooth motion, jaws, rolls, and a disturbance to correct.
+
+A policy that plans anew every few steps cannot tell how long a demonstration has stood still. So
+motions spend little time near rest, and jaws are waited for no longer than they take to arrive.
+"""
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from starjax import rcm
 from starjax.sim.state import EnvState
@@ -11,28 +16,48 @@ from starjax.types import Command
 NOISE_STREAM = 1 << 20  # folded into the key: distinct from every attempt's stream
 CORRELATION = 0.4  # s, correlation time of the disturbance
 SMOOTHING = 0.15  # s, time constant of its low-pass, for smooth motion
+SLOPE = 0.15  # of a way's time, at either end, in which its speed changes
 JAW_TIME = 0.25  # s to close or open
+JAW_DELAY = 2.0 / CONTROL_HZ  # s, for which jaws are waited for at most
+SHUT = 0.0  # opening below which jaws that touch something have it between them
+OPENED = 0.8  # opening from which jaws are clear of what they held
 
 
-def minimum_jerk(fraction: jax.Array) -> jax.Array:
-    """Returns the fraction of the way after a fraction `[...]` of the time, at rest at its ends."""
-    return fraction**3 * (10.0 + fraction * (-15.0 + 6.0 * fraction))
-
-
-def sloped(fraction: jax.Array, slope: float) -> jax.Array:
+def sloped(fraction: jax.Array) -> jax.Array:
     """Returns the fraction of the way after a fraction `[...]` of the time, at constant speed.
 
-    Its speed grows and falls evenly during `slope` of the time at either end; it spends less time
-    near them than `minimum_jerk`.
+    Its speed grows and falls evenly during `SLOPE` of the time at either end.
     """
     left = jnp.minimum(fraction, 1.0 - fraction)
-    done = jnp.where(left < slope, left**2 / (2.0 * slope), left - slope / 2.0) / (1.0 - slope)
+    done = jnp.where(left < SLOPE, left**2 / (2.0 * SLOPE), left - SLOPE / 2.0) / (1.0 - SLOPE)
     return jnp.where(fraction < 0.5, done, 1.0 - done)
 
 
 def jaws(before: jax.Array, target: jax.Array, elapsed: jax.Array) -> jax.Array:
     """Returns the openings `[...]` `elapsed` s after the start of a motion to `target`."""
-    return before + jnp.clip(elapsed / JAW_TIME, 0.0, 1.0) * (target - before)
+    most = 2.0 * elapsed / JAW_TIME
+    return before + jnp.clip(target - before, -most, most)
+
+
+def is_of_jaws(jaws: np.ndarray | tuple[float, ...]) -> np.ndarray:
+    """Returns `[P]` bool, True for phases in which jaws move, from their openings `[P, ...]`.
+
+    The openings are those at the phases' ends. Such a phase ends once the jaws have arrived.
+    """
+    ends = np.reshape(jaws, (len(jaws), -1))
+    return (np.diff(ends, axis=0, prepend=ends[:1]) != 0.0).any(-1)
+
+
+def jaw_limit(before: jax.Array, target: jax.Array) -> jax.Array:
+    """Returns the longest time (s) of a phase of jaws, from openings `[...]` to `target`."""
+    return jnp.max(jnp.abs(target - before)) * JAW_TIME / 2.0 + JAW_DELAY
+
+
+def have_arrived(target: jax.Array, state: EnvState) -> jax.Array:
+    """Returns True once jaws `[A]` on their way to `target` grip, or are open."""
+    is_sent = state.gripper_target < target + 1e-3
+    grip = is_sent & state.touch & (state.gripper < SHUT)
+    return jnp.all(jnp.where(target < 0.0, grip, state.gripper > OPENED))
 
 
 def command(roll: jax.Array, p: jax.Array, jaws: jax.Array, state: EnvState) -> Command:

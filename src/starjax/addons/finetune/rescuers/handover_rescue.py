@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from starjax.addons.finetune.rescuers import midway, way_in
 from starjax.sim.state import EnvState
@@ -18,6 +19,8 @@ from starjax.sim.tasks.rescue import Entry, entry
 MET = 0.006  # m, distance of the object from the place of the pass, at which the taker comes
 # m, horizontally from its grasp, at which a tip is above it: open jaws have more room
 ASIDE = 0.0015
+THERE = 0.0012  # m from its grasp, from which jaws close: they are led to it meanwhile
+ABOUT = 0.02  # m from its grasp, within which a tip does not turn away from it
 EMPTY = -0.65  # measured opening: about -0.5 on a wire, -0.3 on a wall, -0.8 or less without
 
 
@@ -38,8 +41,14 @@ def enter(
       state: at the entry.
     """
     now = entry(state)
-    # Jaws that hold keep their direction; others turn back to the demonstrated roll.
-    normal = jnp.where(now.holds[:, None], state.pose.R[:, :, 1], script.normal)
+    # As in demonstrations, jaws keep their direction once they have turned to their grasp; before,
+    # they turn back to the demonstrated roll, but not at the object.
+    has_turned = jnp.asarray(np.cumsum(play.looks, axis=0) > 0)[phase]
+    goals, _ = play.goals(script.replace(held=held, p=now.p), state)
+    grasps = goals[np.argmax(play.looks, axis=0), np.arange(2)]
+    is_about = jnp.linalg.norm(now.p - grasps, axis=-1) < ABOUT
+    keeps = now.holds | has_turned | is_about
+    normal = jnp.where(keeps[:, None], state.pose.R[:, :, 1], script.normal)
     script = script.replace(
         held=held, p=now.p, roll=now.roll, jaws=now.jaws, jaws_from=now.jaws, normal=normal
     )
@@ -49,7 +58,9 @@ def enter(
     way = jnp.linalg.norm(first.goal - first.p, axis=-1)
     looks = jnp.asarray(play.looks)[first.phase]
     way = jnp.where(looks | ~looks.any(), way, 0.0).max()
-    is_there = (way > 0.0) & (way < midway.ARRIVED)
+    # The jaws' phases and the last one have no way, and last their time.
+    stays = jnp.asarray(scripting.is_of_jaws(play.jaws))[phase] | (phase == len(play.duration) - 1)
+    is_there = ~stays & (way < jnp.where(looks.any(), THERE, midway.ARRIVED))
     script = jax.tree.map(lambda a, b: jnp.where(is_there, a, b), following, first)
     return _moving(play, script, state)
 
@@ -80,8 +91,11 @@ def before_the_pass(
     off, starts = now.p - grasps, jnp.stack([goals[above, 0], goals[near, 1]]) - grasps
     is_coming = _is_above(off, starts, state) & (now.jaws > 0.0)
     is_about = jnp.linalg.norm(off, axis=-1) < ASIDE
-    is_closing = is_about & (jnp.abs(now.jaws) < midway.OPEN)
-    is_met = jnp.linalg.norm(goals[carry, 0] - now.p[0]) < MET
+    # Jaws that are sent to close, but have not yet, go on.
+    is_shutting = (now.jaws <= -midway.OPEN) & ~state.touch & (state.gripper > EMPTY)
+    is_closing = is_about & ((jnp.abs(now.jaws) < midway.OPEN) | is_shutting)
+    is_slow = jnp.linalg.norm(state.velocity[0, :3]) < way_in.SLOW
+    is_met = is_slow & (jnp.linalg.norm(goals[carry, 0] - now.p[0]) < MET)
     passed = jnp.where(is_coming[1], meet, near)
     passed = jnp.where(is_closing[1], take, passed)
     lifted = jnp.where(is_met, passed, carry)
@@ -114,19 +128,19 @@ def _is_above(off: jax.Array, start: jax.Array, state: EnvState) -> jax.Array:
     """
     aside, out = (jnp.linalg.norm(x[:, :2], axis=-1) for x in (off, start))
     top = start[:, 2]
-    is_within = (off[:, 2] > -midway.ARRIVED) & (off[:, 2] < top + ASIDE)
-    is_between = aside < ASIDE + jnp.maximum(out / top, way_in.SLOPE) * off[:, 2]
+    is_within = (off[:, 2] > -way_in.BELOW) & (off[:, 2] < top + ASIDE)
+    slope = jnp.maximum(out / top, way_in.SLOPE)
+    is_between = aside < ASIDE + slope * jnp.maximum(off[:, 2], 0.0)
     return is_within & is_between & way_in.has_come(-off, top, state.velocity[:, :3])
 
 
 def _moving(
     play: handover.Play, script: handover.HandoverScript, state: EnvState
 ) -> handover.HandoverScript:
-    """Returns the script at the time at which its phase has the tools' speed, or their openings."""
+    """Returns the script at the time at which its phase has the tools' speed."""
     way = script.goal - script.p
-    aligned, turned, target = (
-        jnp.asarray(rows, jnp.float32)[script.phase]
-        for rows in (play.aligned, play.turned, play.jaws)
+    aligned, turned = (
+        jnp.asarray(rows, jnp.float32)[script.phase] for rows in (play.aligned, play.turned)
     )
     along = jnp.where(aligned < 1.0, way * jnp.array([0.0, 0.0, 1.0]), way)
     left = jnp.linalg.norm(along, axis=-1)
@@ -134,20 +148,17 @@ def _moving(
     arm = jnp.argmax(left)
     most = jnp.maximum(left[arm], midway.ARRIVED)
     is_still = left[arm] < midway.ARRIVED
+    is_still |= jnp.asarray(scripting.is_of_jaws(play.jaws))[script.phase]
     speed = jnp.maximum(state.velocity[arm, :3] @ along[arm] / most, 0.0)
     at = midway.share(most, speed, script.duration)
-    aside, roll = (scripting.minimum_jerk(jnp.minimum(at / x, 1.0)) for x in (aligned, turned))
-    done = jnp.stack([aside, aside, scripting.minimum_jerk(at)])
+    aside, roll = (scripting.sloped(jnp.minimum(at / x, 1.0)) for x in (aligned, turned))
+    done = jnp.stack([aside, aside, scripting.sloped(at)])
     start = script.goal - way / jnp.maximum(1.0 - done, jnp.array([midway.LEFT, midway.LEFT, 1e-6]))
     roll_from = script.roll_to - (script.roll_to - script.roll) / jnp.maximum(
         1.0 - roll, midway.LEFT
     )
-    # Jaws that move while the tools stay tell the time.
-    moving = jnp.argmax(jnp.abs(script.jaws - target))
-    elapsed = jnp.abs(script.jaws + target)[moving] / 2.0 * scripting.JAW_TIME
     return script.replace(
-        elapsed=jnp.where(is_still, elapsed, at * script.duration),
+        elapsed=jnp.where(is_still, 0.0, at * script.duration),
         start=jnp.where(is_still, script.start, start),
         roll_from=jnp.where(is_still, script.roll_from, roll_from),
-        jaws_from=jnp.where(is_still & (jnp.arange(2) == moving), -target, script.jaws_from),
     )

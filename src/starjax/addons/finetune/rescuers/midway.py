@@ -21,9 +21,11 @@ LONGEST = 0.1  # m, of a whole way: the longest between pegs
 _SHARE = np.linspace(0.0, 0.95, 96)
 
 
-def _pace(share: np.ndarray) -> np.ndarray:
-    """Returns the speed of `scripting.minimum_jerk` as a multiple of the way that is left."""
-    return 30.0 * share**2 / ((1.0 - share) * (1.0 + 3.0 * share + 6.0 * share**2))
+def _pace(share: jax.Array) -> jax.Array:
+    """Returns the speed of `scripting.sloped` as a multiple of the way that is left."""
+    slope = scripting.SLOPE
+    speed = jnp.minimum(jnp.minimum(share, 1.0 - share) / slope, 1.0) / (1.0 - slope)
+    return speed / (1.0 - scripting.sloped(share))
 
 
 def share(left: jax.Array, speed: jax.Array, duration: jax.Array) -> jax.Array:
@@ -35,9 +37,9 @@ def share(left: jax.Array, speed: jax.Array, duration: jax.Array) -> jax.Array:
       duration: s, of the whole motion.
     """
     shares = jnp.asarray(_SHARE)
-    share = jnp.interp(speed * duration / left, jnp.asarray(_pace(_SHARE)), shares)
+    share = jnp.interp(speed * duration / left, _pace(shares), shares)
     # A tool that is too fast to stop in time is at the end of the longest way.
-    most = jnp.interp(1.0 - left / LONGEST, scripting.minimum_jerk(shares), shares)
+    most = jnp.interp(1.0 - left / LONGEST, scripting.sloped(shares), shares)
     return jnp.minimum(share, most)
 
 
@@ -68,34 +70,30 @@ def enter(
 
 
 def _moving(grasp: phases.Grasp, script: GraspT, state: EnvState) -> GraspT:
-    """Returns the script at the time at which its phase has the tool's speed, or its opening."""
+    """Returns the script at the time at which its phase has the tool's speed."""
     timing, way = grasp.timing, script.goal - script.at
     is_straight = jnp.isin(script.phase, jnp.array(grasp.straight))
     # The height decides in a straight phase, which ends early in the other directions.
     along = jnp.where(is_straight, way * jnp.array([0.0, 0.0, 1.0]), way)
     left = jnp.linalg.norm(along)
     is_still = left < ARRIVED
+    is_still |= jnp.asarray(scripting.is_of_jaws(timing.jaws))[script.phase]
     left = jnp.maximum(left, ARRIVED)
     speed = jnp.maximum(state.velocity[0, :3] @ along / left, 0.0)
     least, mean = (jnp.asarray(rows)[script.phase] for rows in (timing.duration, timing.speed))
     duration, at = script.duration, jnp.zeros(())
     for _ in range(ROUNDS):
         at = share(left, speed, duration)
-        whole = left / (1.0 - scripting.minimum_jerk(at))
+        whole = left / (1.0 - scripting.sloped(at))
         duration = jnp.maximum(least, whole / mean) / script.tempo
     aligned = jnp.where(is_straight, phases.ALIGNED, 1.0)
-    aside = scripting.minimum_jerk(jnp.minimum(at / aligned, 1.0))
-    done = jnp.stack([aside, aside, scripting.minimum_jerk(at)])
+    aside = scripting.sloped(jnp.minimum(at / aligned, 1.0))
+    done = jnp.stack([aside, aside, scripting.sloped(at)])
     start = script.goal - way / jnp.maximum(1.0 - done, jnp.array([LEFT, LEFT, 1e-6]))
-    # Jaws that move while the tool stays tell the time.
-    target = jnp.asarray(timing.jaws)[script.phase]
-    moved = jnp.abs(script.jaws + target) / 2.0
-    elapsed = jnp.where(is_still, moved * scripting.JAW_TIME, at * duration)
     return script.replace(
-        elapsed=elapsed,
+        elapsed=jnp.where(is_still, 0.0, at * duration),
         duration=jnp.where(is_still, script.duration, duration),
         start=jnp.where(is_still, script.start, start),
-        jaws_from=jnp.where(is_still, -target, script.jaws_from),
     )
 
 

@@ -13,9 +13,11 @@ from starjax.sim.tasks.needle_handover import expert
 from starjax.sim.tasks.needle_pick import task as single
 from starjax.sim.tasks.rescue import Rescuer, entry
 
-OPEN, AWAY, HOLD = map(expert.PHASES.index, ("open", "away", "hold"))
+OPEN, AWAY, RAISE = map(expert.PHASES.index, ("open", "away", "raise"))
+LEFT = 0.028  # m of a giver from the wire, at which it has left it, on its way or not
 GONE = 0.012  # m of a giver at rest from the wire, beyond which it has gone
-_HELD, _CLOSE = 100, 10  # weights of a segment against the drawn one: held, next to a tool
+_HELD, _CLOSE = 100, 10  # weights of a segment against the drawn one: held, at a tool
+_AT = 0.006  # m from a tip to the wire: further out it may be on its way to the drawn one
 
 
 def resume(key: jax.Array, state: EnvState) -> expert.handover.HandoverScript:
@@ -27,7 +29,7 @@ def resume(key: jax.Array, state: EnvState) -> expert.handover.HandoverScript:
     nearest = jnp.argmin(off, axis=-1)
     is_close = off.min(axis=-1) < expert.HOVER
     pairs = jnp.asarray(expert.PAIRS)
-    weight = jnp.where(now.holds, _HELD, jnp.where(is_close, _CLOSE, 0))
+    weight = jnp.where(now.holds, _HELD, jnp.where(off.min(axis=-1) < _AT, _CLOSE, 0))
     cost = weight * jnp.abs(pairs - nearest) + jnp.abs(pairs - script.held)
     held = pairs[jnp.argmin(cost.sum(-1))]
     is_low = now.p[0, 2] < needle.p[2] + expert.HOVER
@@ -35,8 +37,8 @@ def resume(key: jax.Array, state: EnvState) -> expert.handover.HandoverScript:
     alone = before_the_pass(expert.PLAY, expert.PHASES, script, state, _is_up(state), is_low)
     opens = gives | (is_close[0] & (now.jaws[0] < midway.OPEN))
     speed = jnp.linalg.norm(state.velocity[0, :3])
-    is_going = is_close[0] & ((off[0].min() < GONE) | (speed > way_in.SLOW))
-    taken = jnp.where(opens, OPEN, jnp.where(is_going, AWAY, HOLD))
+    is_going = (off[0].min() < LEFT) & ((off[0].min() < GONE) | (speed > way_in.SLOW))
+    taken = jnp.where(opens, OPEN, jnp.where(is_going, AWAY, RAISE))
     return enter(expert.PLAY, script, jnp.where(takes, taken, alone), held, state)
 
 

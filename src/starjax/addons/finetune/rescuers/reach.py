@@ -32,7 +32,7 @@ def resume(key: jax.Array, state: EnvState) -> TurningScript:
 def act(script: TurningScript, state: EnvState) -> tuple[Command, TurningScript, Command]:
     """Returns the expert's commands with the rest of the roll."""
     rough, reach, label = expert.act(script.reach, state)
-    left = 1.0 - scripting.minimum_jerk(jnp.clip(reach.elapsed / reach.duration, 0.0, 1.0))
+    left = 1.0 - scripting.sloped(jnp.clip(reach.elapsed / reach.duration, 0.0, 1.0))
     rough, label = (
         scripting.command(left * script.roll, way.pose.p, way.gripper, state)
         for way in (rough, label)

@@ -14,6 +14,7 @@ from starjax.sim.tasks import phases
 SLOPE = 0.6
 TURNED = 0.3  # rad from the grasp's normal, within which low jaws come down
 SPREAD = 0.003  # m above the start of the way in that still belongs to it
+BELOW = 0.0015  # m below its grasp, to which a tip is still on its way in, and may close
 TOLERANCE = 0.002  # m below its start, at which a tip has begun it
 SLOW = 0.01  # m/s
 TOWARDS = 0.6  # cosine between velocity and way, above which the tip goes there
@@ -51,10 +52,10 @@ def of(
     is_turned = jnp.abs(across @ normal) > jnp.cos(TURNED)
     is_between = aside < room.clearance + SLOPE * jnp.maximum(above - room.pads, 0.0)
     is_free = is_between & (is_turned | (above > room.pads))
-    is_within = (above > -midway.ARRIVED) & (above < room.top + SPREAD)
+    is_within = (above > -BELOW) & (above < room.top + SPREAD)
     is_here = has_come(way, jnp.asarray(room.top), state.velocity[0, :3])
     is_coming = is_free & is_within & is_here & (state.gripper_target[0] > 0.0)
-    return is_coming, is_free & (jnp.abs(above) < midway.ARRIVED)
+    return is_coming, is_free & (above > -BELOW) & (above < midway.ARRIVED)
 
 
 def has_come(way: jax.Array, top: jax.Array, velocity: jax.Array) -> jax.Array:

@@ -26,7 +26,7 @@ from starjax.types import Agent, Command, Pose
 
 DRIVE, HOLD = range(3, 5)
 TIMING = phases.PhaseTable(
-    duration=(0.5, 1.8, 1.0, 0.0, 1.0),
+    duration=(0.5, 1.7, 0.9, 0.0, 1.0),
     speed=(0.04, 0.03, 0.02, 1.0, 1.0),
     jaws=(-1.0, -1.0, -1.0, -1.0, -1.0),
     tempo=(0.85, 1.2),
@@ -36,7 +36,7 @@ HIGH = 0.04  # m, of the tip: there the needle may turn
 HOVER = 0.015  # m above the start of the arc
 BEFORE = float(np.deg2rad(10.0))  # rad on the arc from there to the entry
 EMERGE = 1.2 * task.EMERGED  # m of wire past the exit
-TURN_SPEED = float(np.deg2rad(22.0))  # rad/s on the arc, the mean
+TURN_SPEED = float(np.deg2rad(24.0))  # rad/s on the arc, the mean
 
 
 @flax.struct.dataclass
@@ -75,8 +75,8 @@ def agent(size: Needle, plane: Plane = vertical) -> Agent:
     def act(script: DriveScript, state: EnvState) -> tuple[Command, DriveScript, Command]:
         """Returns the disturbed command, the script a step later, and the command to record."""
         after = enter(size, script, _following(script, state), state, plane)
-        script, s = phases.advance(script, TIMING, after)
-        share = scripting.minimum_jerk(s)
+        script, s = phases.advance(script, TIMING, after, state)
+        share = scripting.sloped(s)
         straight = wrist_script.straight(script, share)
         on_arc = _on_arc(size, script, share, state, plane)
         drives = script.phase == DRIVE

@@ -19,8 +19,8 @@ from starjax.types import Agent, Command, Pose
 
 CLOSE, LIFT, HOLD = range(3, 6)
 TIMING = phases.PhaseTable(
-    duration=(0.5, 1.8, 0.9, 0.4, 0.9, 1.0),
-    speed=(0.04, 0.03, 0.02, 1.0, 0.02, 1.0),
+    duration=(0.5, 1.7, 0.9, 0.0, 0.9, 1.0),
+    speed=(0.04, 0.032, 0.02, 1.0, 0.022, 1.0),
     jaws=(1.0, 1.0, 1.0, -1.0, -1.0, -1.0),
     tempo=(0.85, 1.2),
 )
@@ -28,6 +28,7 @@ DISTURBANCE = (1.0, 1.0, 0.5, 0.0, 0.2, 0.1)  # its weight in each phase
 HOVER = 0.018  # m above the wire, along the needle's normal
 ABOVE = 0.0  # m of the tip above the wire's middle
 LIFT_HEIGHT = 0.027  # m
+TOP = 0.012  # m above that, to which it rises on in a hold
 GRASP_ANGLE = float((task.FRACTION - 0.5) * np.pi)  # rad on the arc
 HALF_TURN = np.diag([-1.0, -1.0, 1.0]).astype(np.float32)
 
@@ -63,13 +64,14 @@ def enter(script: WristScript, phase: jax.Array, state: EnvState) -> WristScript
     grasp, tip = _grasp(state), script.at
     up = _normal(state.measurements.pick.needle)
     high = state.layout.needle.p[2] + HOVER + task.pick.TIP_SPREAD
+    top = state.layout.needle.p[2] + LIFT_HEIGHT + TOP
     goals = [
         tip.at[2].set(jnp.maximum(tip[2], high)),
         grasp.p + HOVER * up,
         grasp.p,
         tip,
         tip.at[2].add(LIFT_HEIGHT),
-        tip,
+        tip.at[2].set(jnp.clip(top, tip[2], tip[2] + phases.RISE)),
     ]
     is_free = (phase == APPROACH) | (phase == DESCEND)
     return phases.enter(
@@ -93,8 +95,8 @@ def _following(script: WristScript, state: EnvState) -> jax.Array:
 def act(script: WristScript, state: EnvState) -> tuple[Command, WristScript, Command]:
     """Returns the disturbed command, the script a step later, and the command to record."""
     after = enter(script, _following(script, state), state)
-    script, s = phases.advance(script, TIMING, after)
-    share = scripting.minimum_jerk(s)
+    script, s = phases.advance(script, TIMING, after, state)
+    share = scripting.sloped(s)
     weight = jnp.asarray(DISTURBANCE)[script.phase]
     fade = jnp.where(script.phase == DESCEND, 1.0 - s, 1.0)
     return wrist_script.commands(script, wrist_script.straight(script, share), weight, fade, state)

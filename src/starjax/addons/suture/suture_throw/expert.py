@@ -26,7 +26,7 @@ from starjax.types import Agent, Command, Pose
     HOLD,
 ) = range(15)  # fmt: skip
 TIMING = phases.PhaseTable(
-    duration=(1.2, 0.8, 0.3, 0.8, 1.8, 1.0, 0.0, 0.3, 0.6, 2.5, 0.9, 0.3, 0.0, 1.5, 1.0),
+    duration=(1.2, 0.8, 0.0, 0.8, 1.8, 1.0, 0.0, 0.0, 0.6, 2.5, 0.9, 0.0, 0.0, 1.5, 1.0),
     speed=(0.03, 0.02, 1.0, 0.02, 0.03, 0.02, 1.0, 1.0, 0.02, 0.02, 0.02, 1.0, 1.0, 0.03, 1.0),
     jaws=(1.0, 1.0, -1.0, -1.0, -1.0, -1.0, -1.0, 1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0),
     tempo=(0.9, 1.2),
@@ -36,7 +36,6 @@ SETTLES = (DESCEND, DOWN, REACH)  # phases whose disturbance fades
 # The jaws close off a grasp by at most so much along (m) and about (rad) each axis of the tip.
 MISS = (0.0005, 0.0005, 0.0005, 0.035, 0.035, 0.035)
 MISS_STREAM = 1 << 21  # folded into the key: distinct from every other stream
-SLOPE = 0.15  # of a way's time, at either end, in which its speed changes
 HOVER = 0.015  # m above a grasp, along the jaws, and above the start of the arc
 LIFT_HEIGHT = 0.02  # m
 BEFORE = 0.17  # rad on the arc to the entry
@@ -164,8 +163,8 @@ def _following(script: ThrowScript, state: EnvState) -> jax.Array:
 def act(script: ThrowScript, state: EnvState) -> tuple[Command, ThrowScript, Command]:
     """Returns the disturbed command, the script a step later, and the command to record."""
     after = enter(script, _following(script, state), state)
-    script, s = phases.advance(script, TIMING, after)
-    share = scripting.sloped(s, SLOPE)
+    script, s = phases.advance(script, TIMING, after, state)
+    share = scripting.sloped(s)
     is_arc = (script.phase == DRIVE) | (script.phase == OUT)
     on_arc, straight = _on_arc(script, share, state), wrist_script.straight(script, share)
     tip = jax.tree.map(lambda a, b: jnp.where(is_arc, a, b), on_arc, straight)

@@ -65,7 +65,7 @@ def act(script: TrackScript, state: EnvState) -> tuple[Command, TrackScript, Com
     """Returns the disturbed command to execute, the script, and the undisturbed one to record."""
     elapsed = script.elapsed + 1.0 / CONTROL_HZ
     s = jnp.clip(elapsed / script.duration, 0.0, 1.0)
-    fraction = scripting.minimum_jerk(s)
+    fraction = scripting.sloped(s)
 
     def way(distance: jax.Array | float) -> jax.Array:
         line = script.start + fraction * (_target(distance, state) - script.start)

@@ -17,19 +17,19 @@ from starjax.sim.tasks.needle_handover.task import PARK
 from starjax.sim.tasks.needle_pick import task as single
 
 PHASES = (
-    "above", "down", "close", "lift", "carry", "near", "meet", "rest", "take", "open", "away",
-    "raise", "hold",
+    "above", "down", "close", "lift", "carry", "near", "meet", "take", "open", "away", "raise",
+    "hold",
 )  # fmt: skip
 # s, of each phase at tempo 1; jaws of both arms at its end.
-DURATION = (1.6, 1.1, 0.5, 0.9, 1.2, 1.2, 1.0, 0.3, 0.5, 0.4, 0.8, 0.8, 1.0)
-GIVER = (1, 1, -1, -1, -1, -1, -1, -1, -1, 1, 1, 1, 1)
-TAKER = (1, 1, 1, 1, 1, 1, 1, 1, -1, -1, -1, -1, -1)
+DURATION = (1.6, 1.1, 0.0, 0.9, 1.2, 1.2, 1.0, 0.0, 0.0, 0.8, 2.4, 1.0)
+GIVER = (1, 1, -1, -1, -1, -1, -1, -1, 1, 1, 1, 1)
+TAKER = (1, 1, 1, 1, 1, 1, 1, -1, -1, -1, -1, -1)
 # Arms that turn to their segment, by phase; the others keep their roll.
 LOOKS = np.zeros((len(PHASES), 2), bool)
 LOOKS[1, 0] = LOOKS[6, 1] = True
 # Weight of the disturbance at the end of each phase. It acts near the wire too, to demonstrate
 # corrections there.
-DISTURBANCE = (1, 0.4, 0, 0.1, 0.3, 0.5, 0.4, 0.2, 0, 0, 0, 0.1, 0.1)
+DISTURBANCE = (1, 0.4, 0, 0.1, 0.3, 0.5, 0.2, 0, 0, 0, 0.1, 0.1)
 
 TEMPO = (0.9, 1.15)  # range of an episode's pace
 # Fraction of the ways in after which a tool has turned, and in "down" is above its goal.
@@ -39,7 +39,7 @@ HOVER = 0.02  # m above a grasp
 GRASP_ABOVE = 0.001  # m of the tip above the wire: the pads' ends lie 1.5 mm below it
 COME = (0.012, 0.0, 0.021)  # m, start of the taker's way to the wire
 GO = (-0.015, 0.0, 0.026)  # m, the giver's way after the release
-RAISE = 0.01  # m
+RAISE = 0.03  # m, slowly: the needle is judged meanwhile, and nothing stands still
 SKEW = 0.1  # sine of the angle between jaws and the world's y at which a preference shows
 ASIDE = 150.0  # 1/m, preference for a taker's segment on its own side
 MIDDLES, TANGENTS = single.segments()
@@ -91,20 +91,20 @@ def goals(
     give, take = wire + jnp.array([0.0, 0.0, above])
     out = handover.OUT * across
     park, up = jnp.array(PARK), jnp.array([0.0, 0.0, HOVER])
+    lifted = state.layout.needle.p[2] + above + HOVER
     goals = jnp.stack(
         [
             jnp.stack([give + out[0] + up, park[1]]),
             jnp.stack([give, park[1]]),
-            tips,
-            tips.at[0].add(up),
+            tips.at[0].set(give),
+            tips.at[0, 2].max(lifted),
             jnp.stack([tips[0] + jnp.array(MEET) - wire[0], park[1]]),
             jnp.stack([tips[0], take + out[1] + jnp.array(COME)]),
             jnp.stack([tips[0], take]),
+            tips.at[1].set(take),
             tips,
-            tips,
-            tips,
-            tips.at[0].add(jnp.array(GO)),
-            tips.at[1, 2].add(RAISE),
+            tips.at[0].set(give + jnp.array(GO)),
+            tips.at[1, 2].max(MEET[2] + above + RAISE),
             tips,
         ]
     )

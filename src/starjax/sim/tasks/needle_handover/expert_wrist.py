@@ -44,7 +44,7 @@ def _command(roll: jax.Array, p: jax.Array, jaws: jax.Array, state: EnvState) ->
         return straight
     zero = state.measured_trocar.roll_zero
     R = upright(rcm.rotation_from_axis_roll(jnp.asarray(AXES), roll + zero))
-    share = scripting.minimum_jerk(jnp.clip(state.step / (BEND * CONTROL_HZ), 0.0, 1.0))
+    share = scripting.sloped(jnp.clip(state.step / (BEND * CONTROL_HZ), 0.0, 1.0))
     turn = share * jax.vmap(ik.rotation_between)(straight.pose.R, R)
     R = Rotation.from_rotvec(turn).as_matrix() @ straight.pose.R
     feasible = rcm.through(WRIST, Pose(R, p), state.measured_trocar.p_world_trocar)

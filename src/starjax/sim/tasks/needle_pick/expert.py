@@ -16,7 +16,7 @@ from starjax.sim.tasks.phases import APPROACH, DESCEND, RAISE, TURN_LEAD
 
 CLOSE, LIFT, HOLD = range(3, 6)
 TIMING = phases.PhaseTable(
-    duration=(0.5, 1.2, 0.9, 0.4, 0.9, 1.0),
+    duration=(0.5, 1.2, 0.9, 0.0, 0.9, 1.0),
     speed=(0.04, 0.04, 0.024, 1.0, 0.02, 1.0),
     jaws=(1.0, 1.0, 1.0, -1.0, -1.0, -1.0),
     tempo=(0.85, 1.2),
@@ -25,6 +25,7 @@ HOVER = 0.02  # m above the grasp point
 HOVER_OUT = 0.006  # m out from it along the segment's normal
 GRASP_ABOVE = 0.001  # m of the tip above the wire: the pads' ends lie 1.5 mm below it
 LIFT_HEIGHT = 0.027  # m
+TOP = 0.012  # m above that, to which it rises on in a hold
 SKEW = 0.15  # sine of the angle between jaws and the world's y at which a preference shows
 MIDDLES, TANGENTS = task.segments()
 
@@ -62,13 +63,14 @@ def _enter(script: NeedleScript, phase: jax.Array, state: EnvState) -> NeedleScr
     segment = jnp.where(is_approach, drawn, script.segment)
     out = phases.horizontal(normals[segment])
     grasp = needle.p + needle.R @ jnp.asarray(MIDDLES)[segment] + jnp.array([0.0, 0.0, GRASP_ABOVE])
+    high = state.layout.needle.p[2] + GRASP_ABOVE + LIFT_HEIGHT + TOP
     goals = [
         tip.at[2].set(jnp.maximum(tip[2], HOVER)),
         grasp + HOVER_OUT * out + jnp.array([0.0, 0.0, HOVER]),
         grasp,
         tip,
         tip.at[2].add(LIFT_HEIGHT),
-        tip,
+        tip.at[2].set(jnp.clip(high, tip[2], tip[2] + phases.RISE)),
     ]
     return phases.enter(
         script,

@@ -20,7 +20,7 @@ from starjax.sim.tasks.phases import APPROACH, DESCEND, RAISE, TURN_LEAD
 
 CLOSE, LIFT, CARRY, LOWER, OPEN, RETREAT, WAIT = range(3, 10)
 TIMING = phases.PhaseTable(
-    duration=(0.5, 1.2, 0.9, 0.4, 0.6, 0.9, 0.7, 0.4, 0.5, 1.0),
+    duration=(0.5, 1.2, 0.9, 0.0, 0.6, 0.9, 0.7, 0.0, 0.5, 1.0),
     speed=(0.04, 0.04, 0.024, 1.0, 0.035, 0.038, 0.024, 1.0, 0.04, 1.0),
     jaws=(1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0, 1.0, 1.0, 1.0),
     tempo=(0.85, 1.2),
@@ -66,12 +66,14 @@ def init(key: jax.Array, state: EnvState, middle: float = 0.0) -> PegScript:
 
 
 def _following(script: PegScript, state: EnvState) -> jax.Array:
-    """Returns the next phase, the first one if the block is not held."""
+    """Returns the next phase, the first one if the block is not held, or not on its peg."""
     phase, block = script.phase, state.measurements.block
     grasped = block.p + task.RIM_RADIUS * task.wall_normals(block)[script.wall]
     is_held = jnp.sum((grasped - state.pose.p[0]) ** 2) < HELD**2
     is_lost = (phase >= LIFT) & (phase <= CARRY) & ~is_held
-    return jnp.where(is_lost | (phase == WAIT), RAISE, phase + 1).astype(jnp.int32)
+    is_off = (phase == RETREAT) & ~task.is_threaded(block, state.layout.target_peg)
+    again = is_lost | is_off | (phase == WAIT)
+    return jnp.where(again, RAISE, phase + 1).astype(jnp.int32)
 
 
 def _enter(script: PegScript, phase: jax.Array, state: EnvState) -> PegScript:
@@ -113,7 +115,7 @@ def _enter(script: PegScript, phase: jax.Array, state: EnvState) -> PegScript:
         jnp.append(over, low),
         tip,
         tip.at[2].set(tip[2] + HOVER),
-        tip,
+        tip.at[2].add(phases.RISE),
     ]
     return phases.enter(
         script,

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax.sim.state import EnvState
-from starjax.sim.tasks import handover
+from starjax.sim.tasks import handover, phases
 from starjax.sim.tasks.peg_transfer import task as single
 from starjax.sim.tasks.peg_transfer_bimanual.task import PARK
 
@@ -21,7 +21,7 @@ PHASES = (
     "over", "lower", "release", "rise", "wait",
 )  # fmt: skip
 # s, of each phase at tempo 1; jaws of both arms at its end.
-DURATION = (1.6, 1.1, 0.5, 0.9, 1.0, 0.9, 0.8, 0.5, 0.4, 0.6, 1.2, 0.9, 0.5, 0.7, 0.5)
+DURATION = (1.6, 1.1, 0.0, 0.9, 1.0, 0.9, 0.8, 0.0, 0.0, 0.6, 1.2, 0.9, 0.0, 0.7, 1.0)
 GIVER = (1, 1, -1, -1, -1, -1, -1, -1, 1, 1, 1, 1, 1, 1, 1)
 TAKER = (1, 1, 1, 1, 1, 1, 1, -1, -1, -1, -1, -1, 1, 1, 1)
 # Arms that turn to the wall, by phase; the others keep their roll.
@@ -108,7 +108,7 @@ def _goals(script: handover.HandoverScript, state: EnvState) -> tuple[jax.Array,
             jnp.stack([park[0], jnp.append(over, height + RELEASE_HEIGHT)]),
             held,
             held.at[1].add(up),
-            held,
+            held.at[1, 2].set(jnp.clip(PARK[1][2], tips[1, 2], tips[1, 2] + phases.RISE)),
         ]
     )
     return goals, normal

@@ -12,8 +12,8 @@ from starjax.sim.tasks import scripting
 from starjax.sim.tasks.base import CONTROL_HZ
 from starjax.types import Agent, Command
 
-SPEED = 0.035  # m/s, mean along the straight line
-LEAST_TIME = 0.8  # s
+SPEED = 0.04  # m/s, mean along the straight line
+LEAST_TIME = 0.7  # s
 TEMPO = (0.85, 1.2)  # range of an episode's pace
 BULGE = 0.25  # the arc's largest offset from the line, as a fraction of its length
 DEVIATION = 0.0012  # m, of the disturbance
@@ -59,7 +59,7 @@ def act(script: ReachScript, state: EnvState) -> tuple[Command, ReachScript, Com
     dt = 1.0 / CONTROL_HZ
     elapsed = script.elapsed + dt
     s = jnp.clip(elapsed / script.duration, 0.0, 1.0)
-    fraction = scripting.minimum_jerk(s)
+    fraction = scripting.sloped(s)
     p = script.start + fraction * (state.layout.p - script.start)
     p = p + 4.0 * fraction * (1.0 - fraction) * script.side
     noise = scripting.disturb(script.key, script.noise, state.step, jnp.full(3, DEVIATION))

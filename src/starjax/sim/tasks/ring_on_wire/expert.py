@@ -18,8 +18,8 @@ from starjax.types import Agent, Command, Pose
 
 CLOSE, LIFT, CARRY, LOWER, OPEN, LEAVE, WAIT = range(3, 10)
 TIMING = phases.PhaseTable(
-    duration=(0.5, 1.2, 0.9, 0.6, 1.2, 0.4, 0.8, 0.5, 0.7, 0.8),
-    speed=(0.04, 0.04, 0.024, 1.0, 0.02, 0.015, 0.02, 1.0, 0.03, 1.0),
+    duration=(0.5, 1.2, 0.9, 0.0, 1.2, 0.2, 0.8, 0.0, 0.7, 0.8),
+    speed=(0.04, 0.04, 0.024, 1.0, 0.022, 0.0165, 0.022, 1.0, 0.03, 1.0),
     jaws=(1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0, 1.0, 1.0, 1.0),
     tempo=(0.85, 1.15),
 )
@@ -62,11 +62,11 @@ def init(key: jax.Array, state: EnvState) -> RingScript:
 def act(script: RingScript, state: EnvState) -> tuple[Command, RingScript, Command]:
     """Returns the disturbed command to execute, the script, and the undisturbed one to record."""
     after = _enter(script, _following(script, state), state)
-    script, s = phases.advance(script, TIMING, after)
-    fraction = scripting.minimum_jerk(s)
+    script, s = phases.advance(script, TIMING, after, state)
+    fraction = scripting.sloped(s)
     way = script.start + fraction * (script.goal - script.start)
     # On the way down the tool has turned, and goes along its shaft, before it can touch.
-    early = scripting.minimum_jerk(jnp.minimum(s / ALIGNED, 1.0))
+    early = scripting.sloped(jnp.minimum(s / ALIGNED, 1.0))
     shaft = _shaft(script.goal[1:], state)
     back = HOVER * (1.0 - fraction) * shaft
     aside = (1.0 - early) * (script.start + jnp.append(0.0, HOVER * shaft) - script.goal)
@@ -87,7 +87,7 @@ def _following(script: RingScript, state: EnvState) -> jax.Array:
     following = jnp.where(is_held & ~state.measurements.touch, RAISE, following)
     is_away = state.layout.way * state.measurements.ring.p[1] < task.END
     at_last = jnp.where(is_away, RAISE, WAIT)
-    return jnp.where(script.phase == WAIT, at_last, following).astype(jnp.int32)
+    return jnp.where(script.phase >= LEAVE, at_last, following).astype(jnp.int32)
 
 
 def _enter(script: RingScript, phase: jax.Array, state: EnvState) -> RingScript:
@@ -121,7 +121,7 @@ def _enter(script: RingScript, phase: jax.Array, state: EnvState) -> RingScript:
         hung,
         here,
         leaving,
-        here,
+        here.at[3].set(jnp.clip(task.TIP_HOME[2], here[3], here[3] + phases.RISE)),
     ]
     own = {"attempt": attempt, "side": side, "grasp": grasp, "stop": stop}
     return phases.enter(script, TIMING, phase, goals, **own)

@@ -20,7 +20,7 @@ ARC_END = 1.15  # rad, of the expert
 STILL = 0.3  # rad/s
 HOVER = 0.015  # m above the knob
 # s: to above the knob, down, close, along the arc.
-TIMES = jnp.cumsum(jnp.array([1.0, 0.8, 0.5, 2.4]))
+TIMES = jnp.cumsum(jnp.array([1.0, 0.8, 0.3, 2.4]))
 
 
 class Bound(NamedTuple):
@@ -101,7 +101,7 @@ def act(script: Script, state: Any) -> tuple[Command, Script, Command]:
     above = knob + jnp.array([0.0, 0.0, HOVER])
 
     def part(start: jax.Array, end: jax.Array) -> jax.Array:
-        return scripting.minimum_jerk(jnp.clip((time - start) / (end - start), 0.0, 1.0))
+        return scripting.sloped(jnp.clip((time - start) / (end - start), 0.0, 1.0))
 
     p = script.start + part(jnp.zeros(()), hover) * (above - script.start)
     p = p + part(hover, down) * (knob - above)
