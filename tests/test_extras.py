@@ -1,11 +1,13 @@
 """What works without any extra, and what a command says whose extra is missing."""
 
 import importlib.metadata
+import json
 import pathlib
 import re
 import subprocess
 import sys
 import tomllib
+import types
 
 import pytest
 
@@ -54,7 +56,7 @@ def test_a_command_without_its_extra_names_it(monkeypatch, command, capsys):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(errors.UsageError) as raised:
         cli.dispatch([command, "--help"])
-    assert raised.value.argument == command and "starjax[sim]" in raised.value.hint
+    assert raised.value.argument == command and "[sim" in raised.value.hint
     assert cli.guard(cli.dispatch, [command]) == 2 and capsys.readouterr().err.count("\n") == 1
 
 
@@ -77,4 +79,22 @@ def test_the_main_command_without_its_extra_is_one_line():
     program = "import runpy, sys\nsys.argv = ['run']\n"
     done = bare(program + "runpy.run_module('starjax.experiments.run', run_name='__main__')")
     assert done.returncode == 2 and done.stderr.count("\n") == 1
-    assert "starjax[sim,train,report]" in done.stderr
+    assert "[sim,train,report]" in done.stderr
+
+
+def test_an_extra_is_added_from_where_the_installation_came(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert extras.install("sim") == f"pip install -e '{ROOT}[sim]'"
+    monkeypatch.chdir(ROOT)
+    assert extras.install("sim,hub") == "pip install -e '.[sim,hub]'"
+    wheel = tmp_path / "lib/starjax/extras.py"
+    monkeypatch.setattr(extras, "__file__", str(wheel))
+    git = {"url": "https://a.example/s", "vcs_info": {"vcs": "git", "commit_id": "0a1b"}}
+    for record, named in (
+        (json.dumps(git), "starjax[sim] @ git+https://a.example/s@0a1b"),
+        (json.dumps({"url": "file:///x/s.whl"}), "starjax[sim] @ file:///x/s.whl"),
+        (None, "starjax[sim]"),
+    ):
+        distribution = types.SimpleNamespace(read_text=lambda name, text=record: text)
+        monkeypatch.setattr(importlib.metadata, "distribution", lambda name, d=distribution: d)
+        assert extras.install("sim") == f"pip install '{named}'"

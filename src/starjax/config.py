@@ -12,6 +12,7 @@ from starjax.limits import INLINE, Count, CountOrZero, NotNegative, Positive, Ra
 
 # A key of jax has 32 bits: larger seeds would alias smaller ones.
 Seed = Annotated[int, Range(0, 2**32 - 1)]
+SeedOrNone = Annotated[int | None, Range(0, 2**32 - 1)]
 TIME_LIMIT = Range(0.1, 86_400.0)  # s; a control step takes 1/30 s
 DEFAULT_TASK = "peg_transfer"
 
@@ -140,7 +141,7 @@ class TrainConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class EvalConfig:
+class TrialsConfig:
     """Closed-loop evaluation (V-A4)."""
 
     trials: Annotated[int, Range(1, 1_000_000)] = 30  # trials per trocar
@@ -152,13 +153,24 @@ class EvalConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class EvalConfig(TrialsConfig):
+    """Closed-loop evaluation (V-A4)."""
+
+    # random seed of the trials; default: that of the run. Runs of several seeds meet the same
+    # trials, and can be compared trial by trial, if it is fixed
+    seed: SeedOrNone = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class RunConfig:
     """Settings of `starjax run`."""
 
-    method: str = "stardiff"  # method (see starjax list), or all for Table II
+    # method (see starjax list), several as a,b, or all for Table II; they share demonstrations and
+    # report
+    method: str = "stardiff"
     # default values of the other settings (see starjax list); auto: gpu if jax uses one, else cpu
     preset: str = "auto"
-    seed: Seed = 0  # random seed
+    seed: Seed = 0  # random seed of demonstrations, training and trials
     # output directory; auto: runs/PRESET, with a suffix for other scenes and seeds
     out: str = "auto"
     scene: SceneConfig = dataclasses.field(default_factory=SceneConfig)
@@ -166,6 +178,11 @@ class RunConfig:
     policy: PolicyConfig = dataclasses.field(default_factory=PolicyConfig)
     train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
     eval: EvalConfig = dataclasses.field(default_factory=EvalConfig)
+
+    @property
+    def trial_seed(self) -> int:
+        """Seed of the trials."""
+        return self.seed if self.eval.seed is None else self.eval.seed
 
 
 def with_learner(policy: PolicyConfig, learner: str) -> PolicyConfig:

@@ -1,6 +1,9 @@
 """Extras of `pip install "starjax[...]"`, and which of them is missing. Standard library only."""
 
+import importlib.metadata
 import importlib.util
+import json
+import pathlib
 
 from starjax import errors
 
@@ -40,5 +43,30 @@ def require(user: str, *extras: str) -> None:
             user,
             f"{', '.join(absent)} to be installed",
             "no such package",
-            f"pip install 'starjax[{wanted}]'",
+            install(wanted),
         )
+
+
+def install(wanted: str) -> str:
+    """Returns the command that adds extras to this installation, from where it came.
+
+    `starjax` alone would name a package of an index, which may be somebody else's.
+    """
+    checkout = pathlib.Path(__file__).parents[2]
+    if (checkout / "pyproject.toml").is_file():
+        here = "." if pathlib.Path.cwd() == checkout else checkout
+        return f"pip install -e '{here}[{wanted}]'"
+    return f"pip install '{_origin(wanted)}'"
+
+
+def _origin(wanted: str) -> str:
+    """Returns the requirement of this installation with extras, by its record (PEP 610)."""
+    name = f"starjax[{wanted}]"
+    try:
+        text = importlib.metadata.distribution("starjax").read_text("direct_url.json")
+        record = json.loads(text or "")
+        vcs = record.get("vcs_info")
+        url = f"{vcs['vcs']}+{record['url']}@{vcs['commit_id']}" if vcs else record["url"]
+    except (importlib.metadata.PackageNotFoundError, ValueError, KeyError):
+        return name  # from an index
+    return f"{name} @ {url}"

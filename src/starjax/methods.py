@@ -156,6 +156,12 @@ SCORED: Rows = _rows(
 TABLE_II = tuple(name for name, row in _BUILT_IN.items() if row.group in (_NAIVE, _RCM, _OURS))
 
 
+def selected(text: str) -> list[str]:
+    """Returns the methods of a comma-separated list, each once; `all` stands for Table II."""
+    names = [TABLE_II if name == "all" else (name,) for name in text.split(",")]
+    return list(dict.fromkeys(name for group in names for name in group))
+
+
 def behaviour(name: str) -> Method:
     """Returns a row without its names; methods with equal rows behave identically."""
     return SCORED[name]._replace(label="", group="")

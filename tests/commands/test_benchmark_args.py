@@ -63,6 +63,9 @@ def test_a_run_of_the_benchmark_trains_as_its_preset_and_is_scored_by_the_protoc
     config = run_settings.parse("run", [*typed, "--benchmark"], "")
     trials = protocol.settings("evaluate", "reach", plain.eval)
     assert trials != plain.eval
+    trials = dataclasses.replace(trials, seed=protocol.SEED)
     assert config == dataclasses.replace(plain, eval=trials)
-    with mistakes.of("seed", 1):
-        run_settings.parse("run", [*typed, "--benchmark", "--seed", "1"], "")
+    with mistakes.of("eval.seed", 1):
+        run_settings.parse("run", [*typed, "--benchmark", "--eval.seed", "1"], "")
+    other = run_settings.parse("run", [*typed, "--benchmark", "--seed", "1"], "")
+    assert (other.seed, other.trial_seed) == (1, protocol.SEED)

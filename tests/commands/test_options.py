@@ -10,7 +10,7 @@ import sys
 import mistakes
 import pytest
 
-from starjax import cli, config, extras
+from starjax import cli, config, extras, methods
 from starjax.commands import (
     bench,
     completion,
@@ -341,3 +341,59 @@ def test_other_shells_have_every_command_and_flag_too(shell, capsys):
 )
 def test_help_names_the_words_before_the_flags(command, words, capsys):
     assert f" {words} " in f"{helped(command, capsys)[0]} "
+
+
+@pytest.mark.parametrize("columns", ["1", "5", "12"])
+@pytest.mark.parametrize("kind", ["--help", "--help-all"])
+def test_help_ends_in_a_terminal_of_a_few_columns(columns, kind, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", columns)
+    usage, said = helped("inspect", capsys, kind)
+    assert usage.startswith("usage: starjax inspect") and said
+
+
+@pytest.mark.parametrize(
+    ("typed", "out"),
+    [
+        ("--out=~/x", "/home/me/x"),
+        ("--out ~/x", "/home/me/x"),
+        ("--out=~", "/home/me"),
+        ("--out=a~b", "a~b"),
+        ("--out=~nobody-of-this-name/x", "~nobody-of-this-name/x"),
+    ],
+)
+def test_a_tilde_is_the_home_folder(typed, out, monkeypatch):
+    monkeypatch.setenv("HOME", "/home/me")
+    found = options.parse("report", report_command.ReportArgs, ["~/run", *typed.split()], "")
+    assert (found.run, found.out) == (("/home/me/run",), out)
+
+
+@pytest.mark.parametrize(
+    ("typed", "names"),
+    [
+        ("--method dp_ee,stardiff", ["dp_ee", "stardiff"]),
+        ("--method dp_ee stardiff --seed 0", ["dp_ee", "stardiff"]),
+        ("--method=stardiff,dp_ee,stardiff", ["stardiff", "dp_ee"]),
+        ("--method all,stardiff_told", [*methods.TABLE_II, "stardiff_told"]),
+        ("--seed 0 --method dp_ee", ["dp_ee"]),
+    ],
+)
+def test_a_run_may_have_several_methods(typed, names):
+    found = settings(f"--preset smoke {typed}")
+    assert methods.selected(found.method) == names and found.out == "runs/smoke"
+
+
+@pytest.mark.parametrize("typed", ["--method dp_ee,x", "--method dp_ee x", "--method dp_ee,"])
+def test_each_of_several_methods_is_known(typed):
+    with mistakes.of("method"):
+        settings(f"--preset smoke {typed}")
+    with mistakes.of("--method", "none"):
+        settings("--preset smoke --method --seed 1")
+
+
+def test_the_trials_of_several_trainings_may_have_one_seed():
+    runs = [settings(f"--preset smoke --seed {seed} --eval.seed 5") for seed in (0, 1)]
+    assert [run.seed for run in runs] == [0, 1] and [run.trial_seed for run in runs] == [5, 5]
+    assert runs[0].out != runs[1].out
+    assert settings("--preset smoke --seed 3").trial_seed == 3
+    with mistakes.of("eval.seed", -1):
+        settings("--preset smoke --eval.seed -1")

@@ -2,6 +2,7 @@
 
 import collections
 import dataclasses
+import socket
 import threading
 import time
 
@@ -12,7 +13,7 @@ import pytest
 import served
 
 from starjax import deploy, rcm
-from starjax.deploy import batching, plan_executor, wire
+from starjax.deploy import batching, connection_pool, plan_executor, wire
 from starjax.deploy.connection import Connection, Reply
 from starjax.errors import UsageError
 from starjax.monitor import calibrate, scores
@@ -415,3 +416,18 @@ def test_periods_that_take_too_long_are_counted(batches):
         assert client.run(robot, 0.3).overran == client.report.steps == 9
         stopped = client.run(robot, 5.0, should_stop=lambda: client.report.steps >= 12)
         assert stopped.steps == 12
+
+
+def test_a_proxy_of_the_environment_is_not_used(batches, monkeypatch):
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))  # bound and not listening: every connection is refused
+        proxy = f"http://127.0.0.1:{closed.getsockname()[1]}"
+        for name in ("http_proxy", "https_proxy", "all_proxy"):
+            monkeypatch.setenv(name, proxy)
+        monkeypatch.setenv("no_proxy", "")
+        with served.running(batches) as (where, _):
+            with client_of(where, wait_s=10.0) as client:
+                assert client.metadata["method"] == "stardiff"
+            address = f"ws://{where[0]}:{where[1]}"
+            pool = connection_pool.ConnectionPool(address, served.KEY)
+            assert pool.metadata["method"] == "stardiff"

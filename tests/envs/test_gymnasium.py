@@ -5,13 +5,14 @@ import pathlib
 import warnings
 
 import gymnasium
+import mistakes
 import numpy as np
 import pytest
 from gymnasium.utils import env_checker
 
 import starjax.envs
 from starjax import errors, rcm
-from starjax.envs import registration, settings, trocar_draws
+from starjax.envs import registration, settings, trocar_draws, vector
 from starjax.sim import registries
 
 STEPS = 3  # of an episode, so that some end
@@ -173,9 +174,29 @@ def test_wrong_calls_are_one_line(lanes):
         ours.reset(seed=[1, 2, 3])
 
 
+@pytest.mark.parametrize("seed", [2**32, 2**32 + 3, 2**64, -1, 3.0, "3", True])
+def test_a_seed_that_would_alias_another_is_refused(seed):
+    assert vector.checked_seed(np.uint32(2**32 - 1)) == vector.checked_seed(2**32 - 2, 1)
+    with mistakes.of("seed"):
+        vector.checked_seed(seed)
+
+
+@pytest.mark.slow
+def test_seeds_and_options_of_a_reset_are_checked(lanes):
+    ours, theirs = lanes("NextStep")
+    for seed in (2**32 - 1, [0, 2**32], [1.0, 2], [None, -1]):
+        with mistakes.of("seed"):
+            ours.reset(seed=seed)
+    ours.reset(seed=[None, 2**32 - 1])
+    ours.reset(seed=np.uint32(2**32 - 2), options={})
+    for env, options in ((ours, {"trocar": 3}), (theirs, {"low": 0.1})):
+        with mistakes.of("options", next(iter(options))):
+            env.reset(options=options)
+
+
 def test_without_gymnasium_the_extra_is_named(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(errors.UsageError) as raised:
         registration.register()
-    assert "starjax[gym]" in raised.value.hint
+    assert "[gym]" in raised.value.hint
     importlib.reload(starjax.envs)  # the Playground wrapper works without it

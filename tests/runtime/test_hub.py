@@ -19,14 +19,14 @@ def repositories(tmp_path, monkeypatch):
     """Makes a folder of repositories, `model/user/repo` and `dataset/user/repo`."""
     asked = []
 
-    def snapshot_download(repo, *, repo_type, revision):
-        asked.append((repo_type, repo, revision))
+    def snapshot_download(repo, *, repo_type, revision, allow_patterns=None):
+        asked.append((repo_type, repo, revision, *(allow_patterns or ())))
         if not (path := tmp_path / repo_type / repo).exists():
             raise OSError(f"404 Client Error\x1b[2J\nRepository Not Found for {repo}")
         return str(path)
 
-    def hf_hub_download(repo, file, **given):
-        path = pathlib.Path(snapshot_download(repo, **given)) / file
+    def hf_hub_download(repo, filename, **given):
+        path = pathlib.Path(snapshot_download(repo, **given)) / filename
         if not path.exists():
             raise OSError("Entry Not Found")
         return str(path)
@@ -83,3 +83,33 @@ def test_without_the_library_the_extra_is_named(monkeypatch):
     with mistakes.of("--policy") as caught:
         packaged.find("--policy", "hf://me/compact")
     assert "hub" in caught.value.hint
+
+
+@pytest.mark.parametrize(
+    ("name", "revision", "file"),
+    [
+        ("hf://u/r@refs/pr/3", "refs/pr/3", ""),
+        ("hf://datasets/u/r@refs/pr/3/data/a.h5", "refs/pr/3", "data/a.h5"),
+        ("hf://u/r@refs/convert/parquet/a", "refs/convert/parquet", "a"),
+        ("hf://u/r@feature%2Fx/dir/", "feature/x", "dir"),
+        ("hf://u/r@refs%2Fpr%2F12/f", "refs/pr/12", "f"),
+        ("hf://u/r@v1.0/refs/pr/3", "v1.0", "refs/pr/3"),
+        ("hf://u/r/a/b", "", "a/b"),
+    ],
+)
+def test_a_revision_may_be_a_pull_request_or_have_slashes(name, revision, file):
+    found = hub.parse("PATH", name)
+    assert (found.repo, found.revision, found.file) == ("u/r", revision, file)
+
+
+def test_of_a_dataset_only_the_named_part_is_downloaded(repositories):
+    folder, asked = repositories
+    (folder / "dataset/me/many/part[1]").mkdir(parents=True)
+    assert hub.dataset("PATH", "hf://me/many/part[1]").name == "part[1]"
+    hub.dataset("PATH", "hf://me/many")
+    assert asked == [
+        ("dataset", "me/many", None, "part[[]1]", "part[[]1]/*"),
+        ("dataset", "me/many", None),
+    ]
+    with mistakes.of("PATH", "hf://me/many/other"):
+        hub.dataset("PATH", "hf://me/many/other")

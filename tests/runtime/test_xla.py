@@ -6,6 +6,7 @@ import subprocess
 import sys
 import textwrap
 import threading
+from pathlib import Path
 
 import pytest
 
@@ -193,3 +194,9 @@ def test_a_start_takes_the_memory_of_each_device_unless_it_is_full(monkeypatch):
     monkeypatch.setattr("jax.local_devices", lambda: ["first", "second"])
     jax_start.require_devices()
     assert asked == ["first", "second"]
+
+
+def test_a_tilde_in_the_cache_is_the_home_folder(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/me")
+    monkeypatch.setenv("STARJAX_CACHE", "~/cache")
+    assert xla.cache_directory() == Path("/home/me/cache")

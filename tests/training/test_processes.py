@@ -1,6 +1,8 @@
 """Two processes that train together are one run, interrupted and resumed or not."""
 
+import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -156,19 +158,95 @@ def test_variables_that_cannot_be_are_a_mistake(monkeypatch, address, count, ind
         processes.join()
 
 
-@pytest.mark.parametrize(("tasks", "apart", "joins"), [("2", "", 1), ("1", "", 0), ("2", "1", 0)])
+@pytest.mark.parametrize(
+    ("tasks", "apart", "joins"),
+    [("2", "", [2]), ("2(x2)", "", [4]), ("2(x3),1", "", [7]), ("1", "", []), ("2", "1", [])],
+)
 def test_the_tasks_of_a_step_of_srun_are_one_run_unless_kept_apart(
     monkeypatch, tasks, apart, joins
 ):
-    given = []
-    monkeypatch.setattr(processes, "_initialize", lambda **kwargs: given.append(kwargs))
+    counts = []
+    monkeypatch.setattr(processes, "_initialize", lambda name, count, hint: counts.append(count))
     for name in processes._VARIABLES:
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("SLURM_STEP_NUM_TASKS", tasks)
     if apart:
         monkeypatch.setenv("JAX_NUM_PROCESSES", apart)
     processes.join()
-    assert given == [{}] * joins
+    assert counts == joins
+
+
+def test_a_number_of_tasks_of_another_form_is_a_mistake(monkeypatch):
+    monkeypatch.setenv("SLURM_STEP_NUM_TASKS", "two")
+    with mistakes.of("SLURM_STEP_NUM_TASKS", "'two'"):
+        processes.join()
+
+
+LONE = """
+from starjax import cli
+from starjax.runtime import processes
+processes._LATEST_S = {latest}
+cli.run(lambda argv: processes.join() or 0)
+"""
+
+
+def start_lone(latest: int) -> subprocess.Popen:
+    """The first process of a run whose second one never comes."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        address = f"localhost:{free.getsockname()[1]}"
+    values = dict(zip(processes._VARIABLES, (address, "2", "0"), strict=True))
+    return subprocess.Popen(
+        [sys.executable, "-c", LONE.format(latest=latest)],
+        env={**os.environ, **values},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def test_a_process_that_waits_for_others_is_ended_by_a_signal():
+    with start_lone(latest=60) as lone:
+        line = lone.stderr.readline()
+        lone.send_signal(signal.SIGTERM)
+        assert "waits for 2 processes" in line and lone.wait(30) == 130
+
+
+def test_a_process_whose_others_do_not_come_ends_in_a_line():
+    with start_lone(latest=1) as lone:
+        said = lone.communicate(timeout=60)[1].splitlines()
+    assert lone.returncode == 2 and len(said) == 2
+    assert said[1].startswith("starjax: JAX_NUM_PROCESSES: expected 2 processes")
+
+
+DIFFERENT = """
+import os, pathlib, sys
+from starjax import cli
+from starjax.commands import session
+index = os.environ["JAX_PROCESS_ID"]
+
+def command(argv):
+    session.start_jax()
+    folder = pathlib.Path(sys.argv[1].replace("INDEX", index))
+    settings = {"seed": sys.argv[2].replace("INDEX", index)}
+    with session.Session("starjax run", folder).shared(settings) as share:
+        share.first("begun", lambda: True)
+    return 0
+
+cli.run(command)
+"""
+
+
+@pytest.mark.parametrize(
+    ("folder", "seed", "code"), [("run", "0", 0), ("runINDEX", "0", 2), ("run", "INDEX", 2)]
+)
+def test_processes_of_other_settings_or_folders_end_in_a_line(tmp_path, folder, seed, code):
+    script = tmp_path / "different.py"
+    script.write_text(DIFFERENT)
+    started = several.start(script, str(tmp_path / folder), seed)
+    said = several.finish(started, timeout_s=90)
+    assert [process.returncode for process in started] == [code, code], said
+    for _, error in said:
+        assert ("command, settings and folder: expected the same" in error) == bool(code)
 
 
 def test_one_process_agrees_with_itself():

@@ -8,7 +8,7 @@ from starjax.commands import checks
 from starjax.evaluation import protocol
 
 ArgsT = TypeVar("ArgsT", bound="BenchmarkArgs")
-_FIXED = ("eval.trials", "eval.time_limit_s", "seed")
+_FIXED = ("eval.trials", "eval.time_limit_s")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +28,7 @@ def check(args: BenchmarkArgs, default: Any, *fields: str) -> None:
       fields: further settings that it fixes.
     """
     if args.benchmark:
-        for field in (*_FIXED, *fields):
+        for field in (*_FIXED, _seed(args), *fields):
             value = _of(args, field)
             checks.expect(value == _of(default, field), field, "no value with --benchmark", value)
 
@@ -43,7 +43,14 @@ def with_trials(args: ArgsT, command: str, task: str) -> ArgsT:
         return args
     errors.choice("--benchmark", task, protocol.TIME_LIMIT_S)
     trials: Any = protocol.settings(command, task, args.eval)  # type: ignore
-    return dataclasses.replace(args, eval=trials, seed=protocol.SEED)  # type: ignore
+    if _seed(args) == "seed":
+        return dataclasses.replace(args, eval=trials, seed=protocol.SEED)  # type: ignore
+    return dataclasses.replace(args, eval=dataclasses.replace(trials, seed=protocol.SEED))  # type: ignore
+
+
+def _seed(args: Any) -> str:
+    """Returns the field with the seed of the trials; that of a run may be its training's alone."""
+    return "eval.seed" if hasattr(args.eval, "seed") else "seed"
 
 
 def label() -> str:

@@ -56,7 +56,7 @@ def main(argv: Sequence[str]) -> int:
             folder / "trials",
             who,
             sweep.sample(args.seed, args.trials, who.env.task),
-            config_lib.EvalConfig(trials=1, time_limit_s=args.time_limit_s, video_trials=0),
+            config_lib.TrialsConfig(trials=1, time_limit_s=args.time_limit_s, video_trials=0),
             args.seed,
             score_settings=settings,
         )

@@ -19,7 +19,8 @@ _CELL = {"resnet18": 32, "small": 8, "points": 2}
 
 def check(config: config_lib.RunConfig) -> None:
     """Raises UsageError for the first setting that does not go with another."""
-    errors.choice("method", config.method, [*methods.METHODS, "all"])
+    for name in config.method.split(","):
+        errors.choice("method", name, [*methods.METHODS, "all"])
     policy = config.policy
     errors.choice("policy.encoder", policy.encoder, ENCODERS.names())
     if policy.depth_encoder:

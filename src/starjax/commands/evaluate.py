@@ -47,7 +47,7 @@ class EvaluateArgs(benchmark_args.BenchmarkArgs, policy_args.PolicyArgs):
     execute: config_lib.CountOrZero = 0
     out: str = options.AUTO  # directory of the result; auto: one in RUN or in runs/evaluate
     video: bool = True  # write rollout.mp4
-    eval: config_lib.EvalConfig = dataclasses.field(default_factory=config_lib.EvalConfig)
+    eval: config_lib.TrialsConfig = dataclasses.field(default_factory=config_lib.TrialsConfig)
 
 
 def main(argv: Sequence[str]) -> int:
@@ -62,7 +62,11 @@ def main(argv: Sequence[str]) -> int:
     started = session.start("evaluate", argv, folder)
     method, scene = who.trained.method, scenes.settings(who.env.names)
     config = dataclasses.replace(
-        config, method=method, out=str(folder), scene=scene, eval=args.eval
+        config,
+        method=method,
+        out=str(folder),
+        scene=scene,
+        eval=config_lib.EvalConfig(**vars(args.eval)),
     )
     name = args.policy or args.run
     with started.shared() as share:
@@ -95,7 +99,7 @@ def main(argv: Sequence[str]) -> int:
 def _parse(argv: Sequence[str], has_gpu: bool) -> tuple[EvaluateArgs, policy_args.PolicyPath, Path]:
     """Returns the flags, the policy's files and the directory of the result."""
     # Two cores run 48 trials in some minutes, a GPU the paper's 360.
-    small = config_lib.EvalConfig(trials=4, time_limit_s=30.0)
+    small = config_lib.TrialsConfig(trials=4, time_limit_s=30.0)
     default = EvaluateArgs() if has_gpu else EvaluateArgs(eval=small)
     args = options.parse("evaluate", EvaluateArgs, argv, DESCRIPTION, default)
     if args.video:
@@ -124,7 +128,7 @@ def _is_same(folder: Path, who: Any, args: EvaluateArgs, scene: config_lib.Scene
     before, weights = _previous(folder), who.weights
     if args.out != options.AUTO:
         _refuse_foreign(folder, before.get("weights", weights) == weights)
-    trials = dataclasses.asdict(args.eval)
+    trials = dataclasses.asdict(config_lib.EvalConfig(**vars(args.eval)))
     policy = config_json.as_json(who.trained.policy)
     # Older results lack settings that were added later.
     has_same_policy = policy == policy | (before.get("config") or {}).get("policy", {})
@@ -145,7 +149,7 @@ def _identity(result: dict[str, Any]) -> tuple[Any, Any, Any, Any]:
     arms = (config.get("scene") or {}).get("arm")
     # Older results lack settings that were added later.
     trials = dataclasses.asdict(config_lib.EvalConfig()) | (config.get("eval") or {})
-    return result.get("weights"), result.get("seed"), arms, trials
+    return result.get("weights"), result.get("seed"), arms, trials | {"seed": None}
 
 
 def _refuse_foreign(folder: Path, has_same_weights: bool) -> None:

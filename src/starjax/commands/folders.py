@@ -74,11 +74,6 @@ def adopt_equivalent(out: Path, method: str) -> None:
             staged.rename(staged.with_name("evaluation"))
 
 
-def selected(config: config_lib.RunConfig) -> list[str]:
-    """Returns the methods of a run, in the order of Table II."""
-    return list(methods.TABLE_II) if config.method == "all" else [config.method]
-
-
 def is_under_way(folder: Path) -> bool:
     """Returns True for a directory with trials of an evaluation but without its result."""
     plan, result = folder / "evaluation" / "plan.json", folder / "result.json"

@@ -3,6 +3,7 @@
 Imports neither jax nor numpy.
 """
 
+import os
 import shutil
 import textwrap
 from collections.abc import Sequence
@@ -18,9 +19,9 @@ FIRST: dict[type, tuple[str, ...]] = {
     config.DemosConfig: ("from_", "per_trocar"),
     config.PolicyConfig: ("learner", "observation"),
     config.TrainConfig: ("steps",),
-    config.EvalConfig: ("trials", "time_limit_s"),
+    config.TrialsConfig: ("trials", "time_limit_s"),
 }
-_WIDTH = 100  # columns, at most
+_NARROWEST, _WIDTH = 20, 100  # columns
 
 
 def requested(words: Sequence[str]) -> str:
@@ -46,6 +47,12 @@ def page(flags: str, description: str, more: str) -> str:
     usage, _, boxes = flags.partition("\n")
     parts = [usage.rstrip(), _wrapped(description), boxes.strip(), more]
     return "\n\n".join(filter(None, parts))
+
+
+def widen() -> None:
+    """Sets COLUMNS in a terminal too narrow for tyro, which would wrap its text for ever."""
+    if shutil.get_terminal_size().columns < _NARROWEST:
+        os.environ["COLUMNS"] = str(_NARROWEST)
 
 
 def _wrapped(text: str) -> str:

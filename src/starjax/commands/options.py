@@ -7,6 +7,7 @@ import contextlib
 import dataclasses
 import functools
 import io
+import os
 import re
 import shlex
 import sys
@@ -34,7 +35,6 @@ Runs = Annotated[
     tyro.conf.Positional,
     tyro.conf.arg(metavar="RUN [RUN ...]", help_behavior_hint="(required)"),
 ]
-FloatOrNone = Annotated[float | None, tyro.conf.arg(metavar="FLOAT")]
 
 _ALIASES = {(config_lib.SceneConfig, "camera"): ("--cameras",)}
 
@@ -86,7 +86,7 @@ def parse(
     """
     if argv is DECLARE:
         raise Declared(settings, default)
-    words = [_current(word, renamed) for word in argv]
+    words = [_expanded(_current(word, renamed)) for word in argv]
     cli = functools.partial(
         tyro.cli,
         settings,
@@ -122,6 +122,7 @@ def _help(cli: Callable[..., Any], kind: str, name: str, description: str) -> st
         shown.seek(0)
         return shown.read()
 
+    help_pages.widen()
     full = flags(with_ranges)
     text = full if kind == help_pages.FULL else flags(with_ranges, _first_only)
     hides = text != full
@@ -183,6 +184,12 @@ def _current(word: str, renamed: Mapping[str, str]) -> str:
         return word
     errors.warn_renamed(flag_, renamed[flag_])
     return f"{renamed[flag_]}{equals}{value}"
+
+
+def _expanded(word: str) -> str:
+    """Replaces the `~` that begins a value; a shell leaves that of `--out=~/runs` as it is."""
+    name, equals, value = word.partition("=") if word.startswith("-") else ("", "", word)
+    return f"{name}{equals}{os.path.expanduser(value)}"
 
 
 def _refuse(settings: Any, event: Any) -> NoReturn:
@@ -264,7 +271,12 @@ def with_ranges(info: StructInfo) -> StructSpec | None:
         name = "" if field.name == _UNNAMED else plain if plain != field.name else None
         range_and_default = functools.partial(_hint, limits.within(field.type))
         aliases = _ALIASES.get((info.type, plain))
-        hint = tyro.conf.arg(name=name, aliases=aliases, help_behavior_hint=range_and_default)
+        hint = tyro.conf.arg(
+            name=name,
+            aliases=aliases,
+            help_behavior_hint=range_and_default,
+            metavar=_optional_number(field.type),
+        )
         # What stands on the field itself comes later, and wins.
         kind, *rest = typing.get_args(field.type) if is_annotated(field.type) else [field.type]
         # By default the title of a section would be the help of the field before it.
@@ -277,6 +289,13 @@ def _section(hint: Any) -> Any:
     """Returns the dataclass of a field with settings of its own, None for other fields."""
     kind = typing.get_args(hint)[0] if is_annotated(hint) else hint
     return kind if dataclasses.is_dataclass(kind) else None
+
+
+def _optional_number(hint: Any) -> str | None:
+    """Returns the metavar of a number that may be None, None for other types."""
+    kind = typing.get_args(hint)[0] if is_annotated(hint) else hint
+    metavars = {int | None: "INT", float | None: "FLOAT"}
+    return next((name for optional, name in metavars.items() if kind == optional), None)
 
 
 def is_annotated(hint: Any) -> bool:

@@ -31,7 +31,7 @@ class PackArgs:
     # new file
     out: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     # scale of the initial noise; default: that of POLICY
-    temperature: Annotated[options.FloatOrNone, Range(0.0, 1.0)] = None
+    temperature: Annotated[float | None, Range(0.0, 1.0)] = None
 
 
 def main(argv: Sequence[str]) -> int:

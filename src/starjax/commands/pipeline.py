@@ -74,7 +74,7 @@ def run(
 
     config = scenes.resolved(config)
     _check(config.policy, config.train, stages)
-    names = folders.selected(config)
+    names = methods.selected(config.method)
     if "train" in stages:
         scenes.check_wrists(config.scene, names)
     out, trains = Path(config.out), "train" in stages
@@ -82,7 +82,10 @@ def run(
     untrained = [name for name in trained if not folders.weights(out, name).exists()]
     encoder = demonstrations.frozen_encoder(config.policy) if trains and untrained else None
     files.require_writable(out, MIN_FREE_BYTES)
-    with background.until_end(), session.Session(command, out).shared() as share:
+    with (
+        background.until_end(),
+        session.Session(command, out).shared(config_json.as_json(config)) as share,
+    ):
         print(plan_text.plan(config, stages), flush=True)
         work = RunContext(config, encoder, share, command, tracker)
         root, collect, compile_collect = demonstrations.plan(config, work.env, share)
@@ -146,7 +149,12 @@ def _claim(work: RunContext, names: Sequence[str], demos: Path) -> None:
     dataset = f"{demos.name}-{digest[:12]}" if digest else demos.name
     fingerprint = work.encoder and work.encoder.fingerprint
     for name in dict.fromkeys(names):
-        folders.claim(work.out / name, work.config, dataset, fingerprint)
+        folders.claim(work.out / name, _of_method(work, name), dataset, fingerprint)
+
+
+def _of_method(work: RunContext, name: str) -> config_lib.RunConfig:
+    """Returns the settings of one of the run's methods."""
+    return dataclasses.replace(work.config, method=name)
 
 
 def _train(
@@ -228,7 +236,7 @@ def _evaluate(
     from starjax.commands import policy_evaluation
     from starjax.policies import in_env
 
-    config, env, share = work.config, work.env, work.share
+    config, env, share = _of_method(work, name), work.env, work.share
     folder, weights = work.out / name, folders.weights(work.out, name)
     if share.first(f"{name} was scored", lambda: scored.is_complete(config, folder, weights, env)):
         messages.stage("evaluate", f"{name}: already complete, {folder / 'result.json'}")
@@ -240,7 +248,9 @@ def _evaluate(
         trained = policy_evaluation.read(weights)
         who = in_env.place(weights, trained, env, method=name, policy=compiled)
         trials = folder / "evaluation"
-        table = policy_evaluation.rollouts(trials, who, env.task.trocars, config.eval, config.seed)
+        table = policy_evaluation.rollouts(
+            trials, who, env.task.trocars, config.eval, config.trial_seed
+        )
 
     def write() -> None:
         policy_evaluation.write_result(
@@ -248,7 +258,7 @@ def _evaluate(
             who,
             table,
             config,
-            config.seed,
+            config.trial_seed,
             work.command,
             timings_s=_timings(work.out, name, demos.name),
             dataset_digest=folders.demos_digest(demos),

@@ -21,7 +21,7 @@ def plan(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
     """Returns the plan of a run, for its start, without the headline."""
     lines = [*_setting(config), _learning_from(config.demos)]
     lines += [_training(config), *_idle(config.train.batch_size)] if "train" in stages else []
-    lines += [_evaluation(config)] if "evaluate" in stages else []
+    lines += [f"{_evaluation(config)}, seed {config.trial_seed}"] if "evaluate" in stages else []
     return "\n".join([*lines, *_time(config, stages)])
 
 
@@ -182,7 +182,7 @@ def _scene_of(encoder_weights: str) -> Any:
 
 def _ablations(method: str, policy: config_lib.PolicyConfig) -> list[str]:
     """Returns the active ablations: settings that deviate from the method's row."""
-    rows = [methods.SCORED[name] for name in (methods.TABLE_II if method == "all" else [method])]
+    rows = [methods.SCORED[name] for name in methods.selected(method)]
     sees, yaw = policy.sees_trocar, policy.trocar_yaw
     given = "given" if sees == "always" else "not given"
     is_conditioned = sees != "method" and any(row.sees_trocar != (sees == "always") for row in rows)

@@ -60,7 +60,7 @@ def rollouts(
     directory: Path,
     who: Who,
     trocars: rcm.Trocar,
-    settings: config_lib.EvalConfig,
+    settings: config_lib.TrialsConfig,
     seed: int,
     levels: Mapping[str, float] | None = None,
     score_settings: ScoreSettings | None = None,
@@ -100,7 +100,7 @@ def rollouts(
         )
 
 
-def monitor_of(who: Who, settings: config_lib.EvalConfig) -> Monitor | None:
+def monitor_of(who: Who, settings: config_lib.TrialsConfig) -> Monitor | None:
     """Returns the policy's monitor, None if its plans are averaged: it compares single plans."""
     return None if settings.ensemble else who.trained.monitor
 
@@ -134,14 +134,14 @@ def precompile(
         ),
         (params, stats),
         env.task.trocars,
-        _settings(config.eval, config.seed),
+        _settings(config.eval, config.trial_seed),
     )
     seen = features.select_sensors(env.task, env.names.cameras)
     latency.precompile(policy, deciding, params, stats, seen)
     return policy
 
 
-def _settings(settings: config_lib.EvalConfig, seed: int) -> evaluate.EvaluationSettings:
+def _settings(settings: config_lib.TrialsConfig, seed: int) -> evaluate.EvaluationSettings:
     return evaluate.EvaluationSettings(
         trials=settings.trials,
         seed=seed,

@@ -1,6 +1,7 @@
 """Settings of a run from its command line."""
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -11,6 +12,7 @@ from starjax.commands import benchmark_args, checks, options, presets, session
 from starjax.learners import LEARNERS
 
 NO_TRACKER = "none"
+_METHOD = "--method"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -26,6 +28,7 @@ def parse(name: str, argv: Sequence[str], description: str) -> config_lib.RunCon
 
     Only preset `auto` starts jax, as it depends on the device.
     """
+    argv = _joined(argv)
     preset = options.typed_value("preset", argv) or "auto"
     if preset != "auto":
         return _settings(name, argv, description, preset)
@@ -39,6 +42,16 @@ def parse(name: str, argv: Sequence[str], description: str) -> config_lib.RunCon
         reason = presets.reason(config.preset == "gpu")
         print(f"preset auto: {config.preset}, because {reason}", flush=True)
     return config
+
+
+def _joined(argv: Sequence[str]) -> Sequence[str]:
+    """Returns the words with those that follow --method as one, separated by commas."""
+    if argv is options.DECLARE or _METHOD not in argv:
+        return argv
+    first = argv.index(_METHOD) + 1
+    names = list(itertools.takewhile(lambda word: not word.startswith("-"), argv[first:]))
+    rest = argv[first + len(names) :]
+    return [*argv[:first], *[",".join(names)] * bool(names), *rest]
 
 
 def tracker(argv: Sequence[str]) -> str:

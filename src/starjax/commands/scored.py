@@ -1,5 +1,6 @@
 """Results of a run's earlier evaluations."""
 
+import dataclasses
 import shlex
 from pathlib import Path
 from typing import Any
@@ -52,4 +53,5 @@ def _is_of(scored: Any, config: config_lib.RunConfig) -> bool:
     except (AttributeError, KeyError, TypeError, ValueError):
         return False
     alike = config_json.weight_settings(before) == config_json.weight_settings(config)
-    return alike and before.eval == config.eval and scored.seed in (None, config.seed)
+    now = dataclasses.replace(config.eval, seed=before.eval.seed)
+    return alike and before.eval == now and scored.seed in (None, config.trial_seed)

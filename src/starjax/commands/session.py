@@ -4,8 +4,9 @@ Imports jax and numpy only when a session starts: `--help` and mistakes come bef
 """
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
 from starjax.commands import options
@@ -30,15 +31,27 @@ class Session(NamedTuple):
     folder: Path
 
     @contextlib.contextmanager
-    def shared(self) -> Iterator[Any]:
+    def shared(self, settings: Mapping[str, Any] = MappingProxyType({})) -> Iterator[Any]:
         """Holds the directory for this run and silences all processes but the first.
+
+        Args:
+          settings: of the command as JSON values, which some derive from the device.
 
         Yields:
           The `sharing.Share` of this process.
+
+        Raises:
+          errors.UsageError: the processes of the run have different commands, settings or folders.
         """
         from starjax.commands import messages
         from starjax.rollouts import sharing
+        from starjax.runtime import processes
 
+        processes.expect_same(
+            "command, settings and folder",
+            f"{self.command}, into {self.folder.absolute()}",
+            dict(settings),
+        )
         with sharing.shared(self.folder) as share, messages.first_process_only(share.is_first):
             yield share
 

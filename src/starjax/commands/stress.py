@@ -25,7 +25,7 @@ Examples:
   starjax stress runs/cpu/stardiff --disturbance trocar_offset --levels 0 0.005"""
 
 
-_TRIALS = config_lib.EvalConfig(trials=4, time_limit_s=30.0, video_trials=0)
+_TRIALS = config_lib.TrialsConfig(trials=4, time_limit_s=30.0, video_trials=0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +41,7 @@ class StressArgs(benchmark_args.BenchmarkArgs, policy_args.PolicyArgs):
     seed: config_lib.Seed = 0  # random seed of the trials
     # directory of the result; auto: one in RUN or in runs/stress
     out: str = options.AUTO
-    eval: config_lib.EvalConfig = _TRIALS
+    eval: config_lib.TrialsConfig = _TRIALS
 
 
 def main(argv: Sequence[str]) -> int:

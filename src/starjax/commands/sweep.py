@@ -35,14 +35,14 @@ MAX_TROCARS = 1_000_000  # larger values are typos
 Several = Annotated[int, Range(1, MAX_TROCARS)]
 
 
-# Fields of `config.EvalConfig` with other defaults.
+# Fields of `config.TrialsConfig` with other defaults.
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SweepTrials:
     """Closed-loop trials."""
 
     trials: Several = 1  # trials per trocar
     # time limit of a trial in simulated seconds; default: that of RUN, else 60
-    time_limit_s: Annotated[options.FloatOrNone, config_lib.TIME_LIMIT] = None
+    time_limit_s: Annotated[float | None, config_lib.TIME_LIMIT] = None
     chunk: CountOrZero = 0  # trials per saved chunk; 0: one full batch
     video_trials: CountOrZero = 0  # trials whose joint positions are recorded
 
@@ -80,7 +80,7 @@ def main(argv: Sequence[str]) -> int:
     task = who.env.task
     args = benchmark_args.with_trials(args, "sweep", task.name)
     points = _trocars(args, task)
-    trials = config_lib.EvalConfig(**vars(args.eval))
+    trials = config_lib.TrialsConfig(**vars(args.eval))
     table = policy_evaluation.rollouts(_trials(folder, args), who, points, trials, args.seed)
     if not processes.is_first():
         return 0
@@ -109,7 +109,7 @@ def _time_limit_s(run: Path | None) -> float:
     the last command.
     """
     if run is None:
-        return config_lib.EvalConfig.time_limit_s
+        return config_lib.TrialsConfig.time_limit_s
     try:
         return float(files.read_json(run / "result.json")["config"]["eval"]["time_limit_s"])
     except (FileNotFoundError, KeyError, TypeError, ValueError):

@@ -112,6 +112,7 @@ class Connection:
             self.address,
             additional_headers=self._headers,
             compression=None,
+            proxy=None,  # a control loop never passes through one of the environment
             max_size=_MAX_REPLY,
             open_timeout=self._timeout_s,
             close_timeout=self._timeout_s,

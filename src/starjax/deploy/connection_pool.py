@@ -84,6 +84,7 @@ class ConnectionPool:
                 self.address,
                 additional_headers=self._headers,
                 compression=None,
+                proxy=None,
                 max_size=MAX_REPLY,
                 open_timeout=CONNECT_S,
                 close_timeout=1.0,

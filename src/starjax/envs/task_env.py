@@ -40,8 +40,9 @@ class TaskEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode: the first one of `seed`, or without it the next."""
-        super().reset(seed=seed)
+        """Begins an episode: the first one of `seed`, or without it the next. It has no options."""
+        vector.check_options(options)
+        super().reset(seed=None if seed is None else vector.checked_seed(seed))
         observed, info = self._lanes.reset(seed=seed)
         return _only(observed), _numbers(info)
 

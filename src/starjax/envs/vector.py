@@ -84,8 +84,8 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
           options: `reset_mask`, `[N]` bool, the lanes to reset; all by default.
 
         Raises:
-          errors.UsageError: seeds or mask are not of N lanes, or a mask comes before all lanes
-            have begun.
+          errors.UsageError: seeds or mask are not of N lanes, a seed has more than 32 bits, an
+            option is unknown, or a mask comes before all lanes have begun.
           gymnasium.error.Error: this process was forked after jax had started.
         """
         try:
@@ -93,17 +93,18 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         except errors.UsageError as error:
             # A vector environment raises the worker's exception anew, from its text.
             raise gymnasium.error.Error(str(error)) from None
-        super().reset(seed=seed if isinstance(seed, int | None) else None)
+        seeds = self._seeds(seed)
+        check_options(options, "reset_mask")
+        super().reset(seed=seeds[0] if np.ndim(seed) == 0 else None)
         which = np.ones(self.num_envs, bool)
         if options and "reset_mask" in options:
             which = self._mask(options["reset_mask"])
-        seeds = self._seeds(seed)
         if self._lanes is None:
-            drawn = self.np_random.integers(2**31, size=self.num_envs)
-            self._lanes = batch.seeded(self._batch.empty(), _uint32(drawn), which)
+            drawn = self.np_random.integers(2**31, size=self.num_envs).astype(np.uint32)
+            self._lanes = batch.seeded(self._batch.empty(), drawn, which)
         is_new = np.array([each is not None for each in seeds]) & which
         if is_new.any():
-            numbers = _uint32([each or 0 for each in seeds])
+            numbers = np.array([each or 0 for each in seeds], np.uint32)
             self._lanes = batch.seeded(self._lanes, numbers, is_new)
         idle = np.zeros(self._shape, np.float32)
         self._lanes, result = self._batch.advance(
@@ -154,11 +155,13 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         return tuple(np.array(self._batch.camera(self._lanes.state)))
 
     def _seeds(self, seed: Any) -> list[int | None]:
-        if seed is None or isinstance(seed, int | np.integer):
-            return [None if seed is None else int(seed) + i for i in range(self.num_envs)]
+        if seed is None:
+            return [None] * self.num_envs
+        if np.ndim(seed) == 0:
+            return [checked_seed(seed, i) for i in range(self.num_envs)]
         if len(seed) != self.num_envs:
             raise errors.UsageError("seed", f"one or {self.num_envs} of them", len(seed))
-        return list(seed)
+        return [None if each is None else checked_seed(each) for each in seed]
 
     def _mask(self, mask: Any) -> np.ndarray:
         mask = np.asarray(mask)
@@ -179,6 +182,26 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         return info | {f"_{name}": over.copy() for name in info}
 
 
+def checked_seed(seed: Any, lane: int = 0) -> int:
+    """Returns the seed of a lane; a key of jax has 32 bits, where larger ones would alias others.
+
+    Raises:
+      errors.UsageError: it is no whole number from 0 to 2**32 - 1.
+    """
+    is_whole = isinstance(seed, int | np.integer) and not isinstance(seed, bool)
+    if not is_whole or not 0 <= seed + lane < 2**32:
+        expected = "a whole number from 0 to 2**32 - 1" + f" - {lane} for lane {lane}" * bool(lane)
+        raise errors.UsageError("seed", expected, repr(seed))
+    return int(seed) + lane
+
+
+def check_options(options: dict[str, Any] | None, *known: str) -> None:
+    """Raises UsageError for the first option of a reset that is not known."""
+    for name in options or {}:
+        if name not in known:
+            raise errors.UsageError("options", ", ".join(known) or "none", repr(name))
+
+
 def _space(observed: Any) -> spaces.Space:
     if isinstance(observed, dict):
         return spaces.Dict({name: _space(x) for name, x in observed.items()})
@@ -196,7 +219,3 @@ def _info(measured: dict[str, np.ndarray], which: np.ndarray) -> dict[str, np.nd
 def _to_host(tree: Any) -> Any:
     """Copies to writable arrays on the host."""
     return jax.tree.map(np.array, jax.device_get(tree))
-
-
-def _uint32(seeds: Any) -> np.ndarray:
-    return np.array([int(seed) % 2**32 for seed in seeds], np.uint32)

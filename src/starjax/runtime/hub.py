@@ -1,22 +1,26 @@
 """Datasets and policies of the Hugging Face Hub by name: `hf://user/repo[@revision][/file]`.
 
+A revision is a tag, a commit, a branch or a pull request, as `refs/pr/3`.
 The Hub's library downloads into its cache, so a name is fetched once; HF_TOKEN, HF_HOME and
 HF_HUB_OFFLINE are its own variables. Nothing of a repository is executed.
 """
 
+import glob
 import importlib
 import importlib.util
 import re
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from starjax import errors
+from starjax import errors, extras
 
 SCHEME = "hf://"
 _LIBRARY = "huggingface_hub"
 POLICY_FILE = "policy.safetensors"  # of a repository whose name ends without a file
 _PART = r"[\w][\w.\-]*"
-_NAME = re.compile(rf"hf://(datasets/)?({_PART}/{_PART})(?:@([\w.\-]+))?(?:/(.+))?")
+# A slash in a branch's name is written %2F, as the Hub's library does.
+_REVISION = r"refs/(?:pr|convert)/[\w.\-]+|(?:[\w.\-]|%2F)+"
+_NAME = re.compile(rf"hf://(datasets/)?({_PART}/{_PART})(?:@({_REVISION}))?(?:/(.+))?")
 _MAX_TEXT = 200  # characters of the library's error
 _EXPECTED = "hf://user/repo, optionally with @revision and /file"
 
@@ -45,7 +49,8 @@ def parse(argument: str, text: str) -> HubName:
     parts = (match[4] or "").split("/") if match else []
     if match is None or ".." in parts:
         raise errors.UsageError(argument, _EXPECTED, text)
-    return HubName(match[2], match[3] or "", match[4] or "", bool(match[1]))
+    revision, file = (match[3] or "").replace("%2F", "/"), (match[4] or "").strip("/")
+    return HubName(match[2], revision, file, bool(match[1]))
 
 
 def policy(argument: str, text: str) -> Path:
@@ -56,11 +61,14 @@ def policy(argument: str, text: str) -> Path:
     """
     name = parse(argument, text)
     kind = "dataset" if name.is_dataset else "model"
-    return _fetched(argument, text, "hf_hub_download", name, kind, name.file or POLICY_FILE)
+    file = {"filename": name.file or POLICY_FILE}
+    return _fetched(argument, text, "hf_hub_download", name, kind, **file)
 
 
 def dataset(argument: str, text: str) -> Path:
-    """Returns the local directory (or file of it) of a dataset; plain paths are returned as such.
+    """Returns the local directory of a dataset, or of the part of it that the name ends with.
+
+    Nothing else is downloaded. Plain paths are returned as such.
 
     Raises:
       errors.UsageError: as of `policy`.
@@ -68,16 +76,24 @@ def dataset(argument: str, text: str) -> Path:
     if not is_name(text):
         return Path(text)
     name = parse(argument, text)
-    return _fetched(argument, text, "snapshot_download", name, "dataset") / name.file
+    part = glob.escape(name.file)
+    only = {"allow_patterns": [part, f"{part}/*"]} if part else {}
+    path = _fetched(argument, text, "snapshot_download", name, "dataset", **only) / name.file
+    if not path.exists():
+        raise errors.UsageError(argument, "a file or folder of the dataset", text)
+    return path
 
 
-def _fetched(argument: str, text: str, function: str, name: HubName, kind: str, *file: str) -> Path:
+def _fetched(
+    argument: str, text: str, function: str, name: HubName, kind: str, **part: Any
+) -> Path:
+    """Downloads the `part` of a repository that a function of the library has arguments for."""
     if importlib.util.find_spec(_LIBRARY) is None:
-        hint = "pip install 'starjax[hub]'"
+        hint = extras.install("hub")
         raise errors.UsageError(argument, f"{_LIBRARY} to be installed", "no such package", hint)
     download = getattr(importlib.import_module(_LIBRARY), function)
     try:
-        path = download(name.repo, *file, repo_type=kind, revision=name.revision or None)
+        path = download(name.repo, repo_type=kind, revision=name.revision or None, **part)
     # The library and those beneath it raise dozens of types: no repository, no access, no network.
     except Exception as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]

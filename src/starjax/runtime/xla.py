@@ -93,7 +93,7 @@ def cache_directory() -> Path:
     A user without a home gets one in the system's temporary directory.
     """
     if chosen := os.environ.get("STARJAX_CACHE"):
-        return Path(chosen)
+        return Path(chosen).expanduser()
     if base := os.environ.get("XDG_CACHE_HOME"):
         return Path(base) / "starjax"
     try:

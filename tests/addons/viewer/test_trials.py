@@ -5,8 +5,9 @@ import json
 import mistakes
 import numpy as np
 import pytest
+import recorded
 
-from starjax.addons.viewer import trials
+from starjax.addons.viewer import browse, page, trials
 from starjax.addons.viewer.commands import view
 from starjax.runtime import files
 from starjax.sim import scene
@@ -50,3 +51,17 @@ def test_what_is_not_there_is_one_line(folder, tmp_path):
         view._trials(str(folder / "invalid.npz"))
     with mistakes.of("--policy, --run, --expert, --dataset or --trials"):
         view.main(["--trials", "a.npz", "--expert"])
+
+
+def test_a_scene_without_a_camera_is_shown_alone(folder, tmp_path):
+    bare = NAMES._replace(cameras=())
+    (folder / "plan.json").write_text(json.dumps({"scene": bare._asdict()}))
+    recordings = trials.load(folder / "invalid.npz")
+    looks = iter([False] * 6)
+    with page.serve(page.ANY) as server:
+        summary = browse.run(server, recordings, lambda: next(looks, True))
+    assert summary.startswith("1 of 2")
+    recorded.write(tmp_path / "demos")
+    dataset = browse.open_dataset(tmp_path / "demos")
+    assert not dataset.names.cameras and dataset.drawn is None
+    assert browse.read(dataset, dataset.keys[0]).images is None

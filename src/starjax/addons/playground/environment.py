@@ -5,7 +5,8 @@
 >>> state = jax.jit(env.step)(state, jnp.zeros(env.action_size))
 
 One environment, for `vmap`, `jit` and `scan`. As in Playground, wrappers start new episodes and
-apply the time limit `episode_length`.
+apply the time limit `episode_length`. Playground's own for training, `wrap_for_brax_training`,
+repeats the first state of each lane: its trocar and layout stay those of its first `reset`.
 """
 
 import functools

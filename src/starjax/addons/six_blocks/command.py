@@ -109,7 +109,7 @@ def _score_policy(
     if names.task != TASK:
         raise errors.UsageError("RUN or --policy", f"a policy for {TASK}", f"one for {names.task}")
     env = six_blocks.wrap(sim_env.for_policy(names, trained.policy, variant=six.TASK))
-    trials = config_lib.EvalConfig(trials=args.trials, time_limit_s=six.LIMIT_S, video_trials=0)
+    trials = config_lib.TrialsConfig(trials=args.trials, time_limit_s=six.LIMIT_S, video_trials=0)
     who = who._replace(env=env)
     table = policy_evaluation.rollouts(folder, who, six.TASK.trocars, trials, args.seed)
     return table, env, {"method": trained.method, "weights": who.weights}

@@ -95,9 +95,9 @@ def open_dataset(root: Path, image_size: int = 256) -> RecordedDataset:
     if not keys:
         raise errors.UsageError("--dataset", "a folder with episodes", root)
     errors.choice("task of the dataset", names.task, registries.tasks.names())
-    camera, drawn = names.cameras[0], None
+    camera, drawn = next(iter(names.cameras), ""), None
     is_recorded = f"{episodes.IMAGE}{camera}" in description["features"]
-    if not is_recorded and redraw.is_possible(description):
+    if camera and not is_recorded and redraw.is_possible(description):
         env = redraw.scene_env(description, image_size)
         drawn = redraw.images(root, description, records, env)[camera]
     first = np.cumsum([0, *(record["length"] for record in records)])
@@ -128,7 +128,7 @@ def read(dataset: RecordedDataset, key: str) -> Recording:
         frames.colours(dataset.names, dataset.model, record["labels"]),
         _still(dataset, record),
     )
-    camera = f"{episodes.IMAGE}{dataset.names.cameras[0]}"
+    camera = f"{episodes.IMAGE}{next(iter(dataset.names.cameras), '')}"
     images = field(camera) if f"{camera}.npy" in record["files"] else None
     if dataset.drawn is not None:
         episode = dataset.keys.index(key)
@@ -172,7 +172,8 @@ class EpisodePlayer:
         _, tab = page.side_panel(server.gui, "Recorded")
         with tab:
             self._plots = Plots(server.gui, ["recorded"], self.hz)
-            self._pictures = page.Pictures(server.gui, [f"{recordings.names.cameras[0]} sees"])
+            cameras = recordings.names.cameras[:1]
+            self._pictures = page.Pictures(server.gui, [f"{camera} sees" for camera in cameras])
 
     @property
     def last(self) -> int:
