@@ -2,6 +2,7 @@
 
 import shutil
 
+import mistakes
 import synthetic
 
 from starjax.commands import report_command
@@ -20,3 +21,13 @@ def test_folders_are_found_once_and_the_report_lies_beside_them(tmp_path, monkey
     assert first == ([run], run.parent / "report")
     assert second == ([other], other / "report")
     assert third[0] == [other, run]
+
+
+def test_the_reference_of_paired_tests_is_one_of_the_methods(tmp_path):
+    for seed, name in enumerate(("dp_rcm1", "dp_rcm2")):
+        synthetic.run(tmp_path / name, name, seed=seed)
+    with mistakes.of("against", "'dp_rcm4'"):
+        report_command.main([str(tmp_path), "--no-video", "--against", "dp_rcm4"])
+    assert report_command.main([str(tmp_path), "--no-video", "--against", "dp_rcm2"]) == 0
+    tables = (tmp_path / "report" / "tables.md").read_text()
+    assert "Paired comparison with DP-RCM-2" in tables and "| DP-RCM-1 | 72 |" in tables

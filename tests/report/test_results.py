@@ -8,6 +8,7 @@ import pytest
 import synthetic
 from report.conftest import edited
 
+from starjax.evaluation import paired
 from starjax.report import compare, results
 from starjax.runtime import files
 
@@ -46,7 +47,7 @@ def test_a_trajectory_is_shown_with_its_own_trial_or_not_at_all(tmp_path):
         assert rollout.labels.items() <= rollout.trial.labels.items()
     # After a kill some are of another evaluation.
     result = files.read_json(run / "result.json")
-    told = [compare.identity(rollout.trial) for rollout in shown[:2]]
+    told = [paired.identity(rollout.trial) for rollout in shown[:2]]
     for trial in result["trials"]:
         met = (trial["trocar"], trial["trial"], trial["seed"])
         trial["steps"] += met == told[0]

@@ -1,5 +1,7 @@
 """The numbers of the tables, against hand counts."""
 
+import itertools
+
 import numpy as np
 import pytest
 from report.conftest import edited
@@ -34,6 +36,24 @@ def test_paired_counts_are_of_each_pair_of_policies(several):
     twin = twin._replace(path=several[1].path.parent / "stardiff_single")
     together = tables.paired([*several, twin])[1:]  # one policy is one comparison
     assert together[:2] == rows and together[2] == rows[1]
+
+
+def test_any_two_methods_are_compared(several):
+    own = several[:2]
+    (head, row) = tables.paired(own)  # neither is STAR-Diff
+    assert head[2:4] == ["Only the first", "Only the second"]
+    assert row[1:4] == only(own[0].trials, own[1].trials)
+    assert all(run.label in row[0] for run in own)
+    every = tables.paired(several, "all")[1:]
+    assert len(every) == 3 and row[:4] in [other[:4] for other in every]
+    holm = stats.holm([compare.pair(a, b).p for a, b in itertools.combinations(several, 2)])
+    assert [other[5] for other in every] == [formats.p_value(p) for p in holm]
+    head, *against = tables.paired(several, "dp_ee")
+    assert head[2] == "Only DP-EE" and [r[0] for r in against] == [r.label for r in several[1:]]
+    assert against[0][1:4] == only(several[0].trials, several[1].trials)
+    twin = edited(own[1], method="stardiff_single")
+    twin = twin._replace(path=own[1].path.parent / "stardiff_single")
+    assert len(tables.paired([*own, twin], "all")) == 3  # one policy is not compared with itself
 
 
 def test_pairs_are_trials_both_ran_with_one_limit_at_one_place(several):

@@ -173,7 +173,7 @@ def given(config: config_lib.RunConfig, env: Any) -> Path:
         task, features = about["scene"]["task"], about["features"]
         reference = np.array(about["p_world_ref"], np.float32)
     except (KeyError, TypeError, ValueError) as error:
-        hint = "starjax import makes one of LeRobot, robomimic and zarr datasets"
+        hint = "starjax import makes one of a dataset in another format (starjax list)"
         raise errors.UsageError(_FROM, "a dataset that is complete", error, hint) from error
     policy, task_hint = config.policy, f"--task {task} trains on it"
     if task != env.task.name:

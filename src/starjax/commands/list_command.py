@@ -3,7 +3,9 @@
 import dataclasses
 import math
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
 
 from starjax import errors, extensions, methods
 from starjax.commands import options, presets
@@ -22,21 +24,34 @@ if TYPE_CHECKING:  # it imports jax, which `--help` does without
 
 DESCRIPTION = """Lists tasks, arms, tools, methods, learners, presets and policies by name.
 
+KIND is one of them; the arms then have their mounts.
+
 Examples:
-  starjax list"""
+  starjax list
+  starjax list arms"""
 
 Row = tuple[str, str]  # name, description
 
 
+@dataclasses.dataclass(frozen=True)
+class ListArgs:
+    """Flags of the command."""
+
+    # one table, such as arms or action-spaces; default: all
+    kind: Annotated[
+        str, tyro.conf.Positional, tyro.conf.arg(metavar="[KIND]", help_behavior_hint="")
+    ] = ""
+
+
 def main(argv: Sequence[str]) -> int:
     """Prints the tables."""
-    options.parse("list", options.NoFlags, argv, DESCRIPTION)
+    args = options.parse("list", ListArgs, argv, DESCRIPTION)
     from starjax.evaluation.disturbances import DISTURBANCES
     from starjax.rcm import ACTION_SPACES
 
     tables = {
         "tasks (--task, --camera, --demos.expert)": described(registries.tasks, _task),
-        "arms (--arm)": described(registries.arms, _arm),
+        "arms (--arm)": described(registries.arms, _arm if args.kind else _arm_briefly),
         "tools (--tool)": described(registries.tools, _tool),
         "methods (--method)": _methods(),
         "action spaces (of methods, Gymnasium)": described(ACTION_SPACES.registry, _space),
@@ -47,9 +62,12 @@ def main(argv: Sequence[str]) -> int:
         "presets (--preset)": _presets(),
         "policies (--policy, --policy.encoder-weights)": _policies(),
     }
-    for title, table in tables.items():
+    kinds = {title.partition(" (")[0].replace(" ", "-"): title for title in tables}
+    if args.kind:
+        errors.choice("KIND", args.kind, kinds)
+    for title in [kinds[args.kind]] if args.kind else tables:
         print(title, flush=True)  # before the tasks, which import jax
-        rows = list(table)
+        rows = list(tables[title])
         width = max(len(name) for name, _ in rows) if rows else 0
         print("\n".join(f"  {name:{width}}  {text}" for name, text in rows) + "\n")
     return 0
@@ -69,6 +87,10 @@ def _task(task: "Task") -> str:
     arms = f"{task.arms} arm{'s' if task.arms > 1 else ''}"
     sees, shows = ", ".join(task.cameras), ", ".join(task.experts)
     return f"{task.text.title}: {arms}; cameras {sees}; experts {shows}"
+
+
+def _arm_briefly(arm: Arm) -> str:
+    return f"{len(arm.joints)} joints; {len(arm.mounts)} mounts, see starjax list arms"
 
 
 def _arm(arm: Arm) -> str:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from starjax import errors, methods
 from starjax.commands import checks, options
+from starjax.evaluation import locate
 from starjax.runtime import jax_start, xla
 
 DESCRIPTION = """Writes the report of one or more runs: tables.md, figures, rollout.mp4, index.html.
@@ -14,7 +15,8 @@ RUN is the directory of a method, such as runs/cpu/stardiff, or its parent, such
 
 Examples:
   starjax report runs/cpu
-  starjax report runs/cpu/stardiff runs/gpu/stardiff --out report --no-video"""
+  starjax report runs/cpu/stardiff runs/gpu/stardiff --out report --no-video
+  starjax report runs/cpu --against dp_rcm2"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,6 +27,9 @@ class ReportArgs:
     # directory of the report; auto: `report` next to a method's directory or in an evaluation's
     out: str = options.AUTO
     video: bool = True  # write rollout.mp4
+    # method that the others are compared with trial by trial, or all for every pair; default:
+    # stardiff, or every pair without it
+    against: str = ""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -33,7 +38,8 @@ def main(argv: Sequence[str]) -> int:
     checks.expect(bool(args.run), "RUN", "at least one directory", "none")
     once: dict[Path, Path] = {}
     for name in args.run:
-        for run in _with_results(name):
+        for file in locate.results("RUN", name):
+            run = file.parent if file.name == locate.RESULT else file
             once.setdefault(run.resolve(), run)
     runs = list(once.values())
     first = runs[0].resolve()
@@ -46,19 +52,10 @@ def main(argv: Sequence[str]) -> int:
     from starjax.report import build
 
     try:
-        page = build.build(runs, Path(out), with_video=args.video)
+        page = build.build(runs, Path(out), with_video=args.video, against=args.against)
     except ValueError as error:  # of a damaged file, which it names
+        if isinstance(error, errors.UsageError):
+            raise
         raise errors.UsageError("RUN", "results that are whole", error) from error
     print(f"report: {page}")
     return 0
-
-
-def _with_results(name: str) -> list[Path]:
-    """Returns a directory with a result, or those inside it."""
-    path = Path(name)
-    runs = [path] if (path / "result.json").is_file() else sorted(path.glob("*/result.json"))
-    if not (name and runs):
-        raise errors.UsageError(
-            "RUN", "a directory with result.json, or a parent of such directories", name or "none"
-        )
-    return [file if file.is_dir() else file.parent for file in runs]

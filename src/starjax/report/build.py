@@ -27,6 +27,7 @@ def build(
     runs: Sequence[pathlib.Path],
     out: pathlib.Path,
     with_video: bool = True,
+    against: str = "",
     report: Callable[[str], None] = print,
 ) -> pathlib.Path:
     """Writes the report of the run directories `runs` into `out`; returns its index.html.
@@ -34,24 +35,29 @@ def build(
     Each directory holds the files that `results.load` reads; the report omits those that a run did
     not produce. There is no video without a recorded rollout or with `with_video` off. An earlier
     report in `out` stays until this one is complete; then its files that this page does not show
-    are deleted, its video too.
+    are deleted, its video too. Paired tests compare the runs with those of the method `against`,
+    or in all pairs, see `tables.paired`.
 
     Raises:
+      errors.UsageError: no run is of the method `against`.
       ValueError: no runs, of several tasks, or a directory without a result.
       files.StorageError: another process is writing a report into `out`.
     """
     if not runs:
         raise ValueError("runs: expected at least one run directory, got none")
     loaded = _named_apart(sorted((results.load(path) for path in runs), key=_order))
+    if against:
+        names = [*dict.fromkeys(run.result.method for run in loaded), tables.ALL]
+        errors.choice("against", against, names)
     focus = _focus(loaded)
     recorded = any(run.rollouts for run in loaded)
     with files.lock(out):
-        text = tables.markdown(loaded)
+        text = tables.markdown(loaded, against)
         pairs, drawn = _figures(loaded, focus)
         film = _film(loaded, out / _FILM, report) if with_video and recorded else None
         clip = film.read_bytes() if film else None
         playback = _playback(loaded, report) if with_video and recorded else None
-        html = page.render(loaded, focus, pairs, clip, playback)
+        html = page.render(loaded, focus, pairs, clip, playback, against)
         made = {"tables.md": text.encode(), **drawn, "index.html": html.encode()}
         made |= {_PLAYBACK: playback.html.encode()} if playback else {}
         for name, data in made.items():

@@ -45,8 +45,12 @@ def render(
     figures: Figures,
     video: bytes | None,
     playback: Playback | None = None,
+    against: str = "",
 ) -> str:
-    """Renders the page of `runs`, whose headline numbers are those of `focus`."""
+    """Renders the page of `runs`, whose headline numbers are those of `focus`.
+
+    `against` is that of `tables.paired`.
+    """
     return (
         environment()
         .get_template("page.html")
@@ -58,6 +62,7 @@ def render(
             figures=figures,
             video=video,
             playback=playback,
+            against=against,
         )
     )
 

@@ -94,20 +94,21 @@ def cards(run: results.Run) -> Iterator[Card]:
         yield Card("One policy call", f"{ms['p50']:.1f}", " ms", more)
 
 
-def comparisons(runs: Sequence[results.Run]) -> list[TitledTable]:
-    """Returns paired tests and success by three tests of several runs."""
+def comparisons(runs: Sequence[results.Run], against: str = "") -> list[TitledTable]:
+    """Returns paired tests, as `tables.paired`, and success by three tests of several runs."""
     by_test_note = notes.by_test(compare.task_text(runs))
     return _titled(
-        ("Paired with STAR-Diff", tables.paired(runs), notes.PAIRED),
+        (tables.paired_title(runs, against), tables.paired(runs, against), notes.PAIRED),
         ("Success by three tests (%)", tables.by_test(runs, formats.brief), by_test_note),
     )
 
 
-def swept(runs: Sequence[results.Run]) -> list[TitledTable]:
+def swept(runs: Sequence[results.Run], against: str = "") -> list[TitledTable]:
     """Returns success through the trocars of sweeps, and its paired tests."""
+    title = f"{tables.paired_title(runs, against)} {tables.SWEPT_PAIRED}"
     return _titled(
         (tables.SWEPT, tables.swept(runs, formats.brief), notes.SWEPT),
-        (tables.SWEPT_PAIRED, tables.paired(results.swept(runs)), notes.PAIRED),
+        (title, tables.paired(results.swept(runs), against), notes.PAIRED),
     )
 
 

@@ -18,22 +18,6 @@ class Rate(NamedTuple):
     high: float
 
 
-class Paired(NamedTuple):
-    """Two methods on the same trials.
-
-    Attributes:
-      pairs: number of shared trials.
-      only_a: successes of the first alone.
-      only_b: successes of the second alone.
-      p: McNemar's exact p value.
-    """
-
-    pairs: int
-    only_a: int
-    only_b: int
-    p: float
-
-
 def rate(successes: int, trials: int) -> Rate:
     """Makes a rate with its interval."""
     return Rate(successes, trials, successes / trials, *statistics.wilson(successes, trials))
@@ -44,12 +28,6 @@ def gap(seen: Rate, unseen: Rate) -> tuple[float, float, float]:
     outcomes = [np.arange(score.trials) < score.successes for score in (seen, unseen)]
     middle, (low, high) = statistics.generalization_gap(*outcomes)
     return middle, low, high
-
-
-def mcnemar(a: Sequence[bool], b: Sequence[bool]) -> Paired:
-    """Applies McNemar's exact test to outcomes on the same trials."""
-    test = statistics.mcnemar(np.array(a, bool), np.array(b, bool))
-    return Paired(len(a), test["only_a"], test["only_b"], test["p_value"])
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

@@ -5,26 +5,28 @@ from collections.abc import Callable, Sequence
 
 from starjax import methods
 from starjax.evaluation import sweep
+from starjax.evaluation.paired import Paired
 from starjax.evaluation.result import Trial
 from starjax.report import captions, compare, formats, notes, outcomes, results, stats
 from starjax.report.formats import Table
 
 TESTS = {"strict": outcomes.strict, "loose": outcomes.loose, "safe": outcomes.safe}
 SWEPT = "Success through other trocars (%)"
-SWEPT_PAIRED = "Paired comparison with STAR-Diff through these trocars"
+SWEPT_PAIRED = "through these trocars"
+ALL = "all"  # of --against: every pair of runs
 _QUANTILES = ("p50", "p95", "p99")
 _COMPILE = ": compile"  # suffix of a phase's compile time
 
 
-def markdown(runs: Sequence[results.Run]) -> str:
-    """Renders tables.md: every table with numbers, each with a note."""
-    text = compare.task_text(runs)
+def markdown(runs: Sequence[results.Run], against: str = "") -> str:
+    """Renders tables.md: every table with numbers, each with a note; `against` as in `paired`."""
+    text, title = compare.task_text(runs), paired_title(runs, against)
     parts = [
         (f"Table III. Task success on {text.title} (%)", success(runs), notes.SUCCESS),
         ("Success by three tests (%)", by_test(runs), notes.by_test(text)),
-        ("Paired comparison with STAR-Diff", paired(runs), notes.PAIRED),
+        (title, paired(runs, against), notes.PAIRED),
         (SWEPT, swept(runs), f"{notes.SWEPT} {notes.CELL}"),
-        (SWEPT_PAIRED, paired(results.swept(runs)), notes.PAIRED),
+        (f"{title} {SWEPT_PAIRED}", paired(results.swept(runs), against), notes.PAIRED),
         ("Failed trials", failures(runs), notes.FAILURES),
         ("RCM error (mm)", rcm(runs), notes.RCM),
         ("Table IV. Inference time", inference(runs), notes.inference(runs)),
@@ -87,22 +89,54 @@ def failures(runs: Sequence[results.Run]) -> Table:
     return table
 
 
-def paired(runs: Sequence[results.Run]) -> Table:
-    """Makes the table of McNemar's tests of STAR-Diff against each run with the same trials."""
-    table = [["Against", "Pairs", "Only STAR-Diff", "Only the other", "p", "p (Holm)"]]
-    ours = [run for run in runs if run.result.method == compare.OURS]
-    others = [run for run in runs if run.result.method != compare.OURS]
-    pairs = [*itertools.product(ours, others), *itertools.combinations(ours, 2)]
+def paired(runs: Sequence[results.Run], against: str = "") -> Table:
+    """Makes the table of McNemar's tests of runs with the same trials, Holm over all its rows.
+
+    Args:
+      runs: any runs.
+      against: method that the others are compared with, `ALL` for every pair; by default STAR-Diff,
+        or every pair without it.
+    """
+    reference = reference_of(runs, against)
+    if reference == ALL:
+        pairs = [p for p in itertools.combinations(runs, 2) if _policy(p[0]) != _policy(p[1])]
+    else:
+        ours = [run for run in runs if run.result.method == reference]
+        others = [run for run in runs if run.result.method != reference]
+        pairs = [*itertools.product(ours, others), *itertools.combinations(ours, 2)]
     tested = [(a, b, test) for a, b in pairs if (test := compare.pair(a, b))]
+    first = {a.path: a.label for a, *_ in tested}
+    is_one = reference != ALL and len({a.path for a, _ in pairs}) == 1
+    names = ["Against", *_only(next(iter(first.values()), ""), "the other")]
+    if not is_one:
+        names = ["First against second", *_only("the first", "the second")]
     # Methods with one policy, such as DP-RCM-4 and STAR-Diff-Single, count once for Holm.
     single = {_comparison(a, b, test): test.p for a, b, test in tested}
     corrected = dict(zip(single, stats.holm(list(single.values())), strict=True))
+    table = [[names[0], "Pairs", *names[1:], "p", "p (Holm)"]]
     for a, b, test in tested:
         p = corrected[_comparison(a, b, test)]
         counts = [str(n) for n in (test.pairs, test.only_a, test.only_b)]
-        against = b.label if len(ours) == 1 else f"{b.label}, of {a.label}"
-        table.append([against, *counts, formats.p_value(test.p), formats.p_value(p)])
+        name = b.label if is_one else f"{a.label} against {b.label}"
+        table.append([name, *counts, formats.p_value(test.p), formats.p_value(p)])
     return table
+
+
+def reference_of(runs: Sequence[results.Run], against: str) -> str:
+    """Returns the method that `paired` compares the others with, or `ALL`."""
+    has_ours = any(run.result.method == compare.OURS for run in runs)
+    return against or (compare.OURS if has_ours else ALL)
+
+
+def paired_title(runs: Sequence[results.Run], against: str) -> str:
+    """Returns the heading of `paired`."""
+    reference = reference_of(runs, against)
+    label = methods.SCORED[reference].label if reference in methods.SCORED else ""
+    return f"Paired comparison with {label}" if label else "Paired comparison of all methods"
+
+
+def _only(*names: str) -> list[str]:
+    return [f"Only {name}" for name in names]
 
 
 def rcm(runs: Sequence[results.Run]) -> Table:
@@ -152,11 +186,13 @@ def _bin(trial: Trial) -> int:
     return int(sweep.bin_of(trial.distance_m or 0.0))
 
 
-def _comparison(a: results.Run, b: results.Run, test: stats.Paired) -> tuple[object, ...]:
-    """Returns the identity of a comparison: two policies and their trials' outcomes.
+def _comparison(a: results.Run, b: results.Run, test: Paired) -> tuple[object, ...]:
+    """Returns the identity of a comparison: two policies and their trials' outcomes."""
+    return _policy(a), _policy(b), test
 
-    A policy is identified by its weights, or by its folder if the result does not name them.
-    """
-    method = b.result.method
-    place = b.path.parent if b.path.name == method else b.path
-    return a.path, b.result.weights or place, methods.behaviour(method), test
+
+def _policy(run: results.Run) -> tuple[object, ...]:
+    """Identifies a policy by its weights, or by its folder if the result does not name them."""
+    method = run.result.method
+    place = run.path.parent if run.path.name == method else run.path
+    return run.result.weights or place, methods.behaviour(method)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from starjax.evaluation import paired
 from starjax.report import compare, outcomes, results, style
 from starjax.report.scene_view import SceneView
 from starjax.sim.names import SceneNames
@@ -90,7 +91,7 @@ def _panel(
     drawn = [(i, r) for i, run in enumerate(runs) for r in run.rollouts if r.trial.trocar == index]
     if len(runs) > 1:  # one trial for all methods: their paths compare
         shared = compare.most_shared(r.trial for _, r in drawn)
-        drawn = [(i, r) for i, r in drawn if compare.identity(r.trial) == shared]
+        drawn = [(i, r) for i, r in drawn if paired.identity(r.trial) == shared]
     trial, trocars = drawn[0][1].trial, drawn[0][1].p_world_trocar
     kind, (r, polar, azimuth) = "Seen" if trial.seen else "Unseen", outcomes.place(trial)
     axis.set_title(f"{kind} trocar {index}\nr {r}, θ {polar}, φ {azimuth}", fontsize=8)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from starjax.evaluation import paired
 from starjax.evaluation.result import Result
 from starjax.report import compare, encode, outcomes, results, scene_view, style
 from starjax.rollouts import trial_key
@@ -170,7 +171,7 @@ def _spread(rollouts: list[results.TrialTrajectory], count: int) -> list[results
 def _same_trial(runs: Sequence[results.Run], max_clips: int) -> list[Clip]:
     """Selects the same trial of up to `max_clips` runs, the last ones of more."""
     kept = [
-        {compare.identity(r.trial): r for r in run.rollouts if r.qpos is not None} for run in runs
+        {paired.identity(r.trial): r for r in run.rollouts if r.qpos is not None} for run in runs
     ]
     recorded = [(run, rollouts) for run, rollouts in zip(runs, kept) if rollouts][-max_clips:]
     if not recorded:

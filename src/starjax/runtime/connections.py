@@ -4,7 +4,7 @@ import contextlib
 import http
 import ipaddress
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from websockets.asyncio import server as sockets
@@ -17,18 +17,30 @@ _SPARE = 8  # connections beyond the maximum that get a response instead of bein
 _SCHEMES = ("http", "https")
 
 
-def is_own(request: Any) -> bool:
-    """Returns True for a page that this server sent, and for a program other than a browser.
+def refusal(request: Any, names: Sequence[str] = ()) -> str:
+    """Returns why a request comes from a foreign page, empty for the own page and for programs.
 
     A browser sends the origin of the page that connects. The server's own page has the host of the
     request. That host is an address or a name of this machine: another name may lead here by its
     owner's choice (DNS rebinding).
+
+    Args:
+      request: of a websocket or a page.
+      names: further names of this machine, as a proxy or a domain gives it.
     """
-    headers = request.headers
+    headers, allowed = request.headers, [name.lower() for name in names]
     hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
-    if len(hosts) != 1 or len(origins) > 1 or not _is_here(hosts[0]):
-        return False
-    return not origins or origins[0] in [f"{scheme}://{hosts[0]}" for scheme in _SCHEMES]
+    if len(hosts) != 1 or len(origins) > 1:
+        return "expected one Host and at most one Origin"
+    host = _name(hosts[0])
+    if not _is_here(host) and host not in allowed:
+        return f"{host} is no name of this machine; --allow-host {host} admits it"
+    if not origins or origins[0] in [f"{scheme}://{hosts[0]}" for scheme in _SCHEMES]:
+        return ""
+    scheme, _, origin = origins[0].partition("://")
+    if scheme in _SCHEMES and _name(origin) in allowed:  # a proxy may send its own Host
+        return ""
+    return f"a page of {origins[0]} is not the own page; --allow-host {_name(origin)} admits it"
 
 
 def limited(most: int) -> Any:
@@ -77,14 +89,17 @@ def count(connection: sockets.ServerConnection) -> int:
 
 
 @contextlib.contextmanager
-def only_own_pages() -> Iterator[None]:
-    """Restricts websocket servers of other libraries that start within the context."""
+def only_own_pages(names: Sequence[str] = ()) -> Iterator[None]:
+    """Restricts websocket servers of other libraries that start within the context.
+
+    `names` are those of `refusal`.
+    """
     original = sockets.serve
 
     def serve(*args: Any, process_request: Any = None, **options: Any) -> Any:
         def admit(connection: Any, request: Any) -> Any:
-            if not is_own(request):
-                return connection.respond(http.HTTPStatus.FORBIDDEN, "expected the own page\n")
+            if why := refusal(request, names):
+                return connection.respond(http.HTTPStatus.FORBIDDEN, f"{why}\n")
             return process_request(connection, request) if process_request else None
 
         limits = {"create_connection": limited(MAX_PAGES), "open_timeout": HANDSHAKE_S}
@@ -97,9 +112,13 @@ def only_own_pages() -> Iterator[None]:
         sockets.serve = original
 
 
-def _is_here(host: str) -> bool:
-    name = host.rsplit(":", 1)[0] if host.rpartition(":")[2].isdecimal() else host
-    if name.lower() in ("localhost", socket.gethostname().lower()):
+def _name(host: str) -> str:
+    """Returns a host without its port, in lower case."""
+    return (host.rsplit(":", 1)[0] if host.rpartition(":")[2].isdecimal() else host).lower()
+
+
+def _is_here(name: str) -> bool:
+    if name in ("localhost", socket.gethostname().lower()):
         return True
     try:
         return bool(ipaddress.ip_address(name.strip("[]")))

@@ -1,6 +1,7 @@
 """The page's server and its handles, without a client."""
 
 import contextlib
+import http.client
 import pathlib
 import socket
 
@@ -190,3 +191,34 @@ def test_unfinished_handshakes_are_dropped(page):
         half[-1].settimeout(connections.HANDSHAKE_S / 2)  # at once, not after it
         with contextlib.suppress(ConnectionResetError):
             assert half[-1].recv(1) == b""
+
+
+def asked(port, host, origin=""):
+    """Status and text of a request for the page."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
+    connection.putrequest("GET", "/", skip_host=True)
+    connection.putheader("Host", host)
+    if origin:
+        connection.putheader("Origin", origin)
+    connection.endheaders()
+    response = connection.getresponse()
+    return response.status, response.read().decode(errors="replace")
+
+
+@pytest.mark.parametrize(
+    ("host", "origin"),
+    [
+        ("lab.example.org", ""),
+        ("lab.example.org", "https://lab.example.org"),
+        ("localhost:8080", "https://LAB.example.org"),  # a proxy that sends its own Host
+        ("127.0.0.1", "http://lab.example.org:8443"),
+    ],
+)
+def test_a_name_is_admitted_by_the_option_alone(page, host, origin):
+    status, text = asked(page.get_port(), host, origin)
+    assert status == 403 and "--allow-host lab.example.org" in text
+    with pages.serve(pages.ANY, names=("Lab.example.org",)) as server:
+        assert asked(server.get_port(), host, origin)[0] == 200
+        for other in ("evil.example.org", "lab.example.org.evil.org", "xlab.example.org"):
+            assert asked(server.get_port(), other)[0] == 403
+            assert asked(server.get_port(), "localhost", f"https://{other}")[0] == 403

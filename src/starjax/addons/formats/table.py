@@ -8,12 +8,12 @@ TABLE = AddOn(
     commands={
         "export": Subcommand(
             f"{_HERE}.commands.export_command",
-            "export demonstrations to LeRobot, robomimic or zarr",
+            "export demonstrations in the format of another library",
             ("sim", "train", "formats"),
         ),
         "import": Subcommand(
             f"{_HERE}.commands.import_command",
-            "import a dataset from LeRobot, robomimic or zarr",
+            "import a dataset in the format of another library",
             ("sim", "train", "formats"),
         ),
     },

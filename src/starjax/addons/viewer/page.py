@@ -31,8 +31,16 @@ _STATUS_STYLE = "font-size:0.85em;line-height:1.5;padding:0 0.9em 0.4em"
 
 
 @contextlib.contextmanager
-def serve(port: int = PORT, label: str = "starjax", host: str = HOST) -> Iterator[Any]:
+def serve(
+    port: int = PORT, label: str = "starjax", host: str = HOST, names: Sequence[str] = ()
+) -> Iterator[Any]:
     """Yields an empty `viser.ViserServer` in the house's colours, by default for this machine only.
+
+    Args:
+      port: of the page.
+      label: of the page.
+      host: address that it listens at.
+      names: further names under which browsers may open it, see `connections.refusal`.
 
     Raises:
       errors.UsageError: the port is taken or not permitted.
@@ -42,7 +50,7 @@ def serve(port: int = PORT, label: str = "starjax", host: str = HOST) -> Iterato
     from starjax.runtime import connections
 
     # viser prints a banner, and lets pages of other origins connect.
-    with contextlib.redirect_stdout(io.StringIO()), connections.only_own_pages():
+    with contextlib.redirect_stdout(io.StringIO()), connections.only_own_pages(names):
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
     try:
         # viser silently takes the next free port, which the user would not open.

@@ -31,7 +31,8 @@ class ExportArgs:
     ]  # directory of demonstrations
     # new file or directory
     out: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
-    format: str = "lerobot"  # format: lerobot (LeRobotDataset v3.0), robomimic (HDF5) or zarr
+    # lerobot (LeRobotDataset v3.0), lerobot-v2.1, robomimic (HDF5) or zarr
+    format: str = "lerobot"
     # image size, pixels per side, for a dataset without recorded images; 0: no images
     image_size: Annotated[int, Range(0, 4_096)] = 256
     state_with_trocar: bool = False  # append the trocar to the state, for readers of it alone

@@ -37,7 +37,8 @@ class ImportArgs:
     cameras: tuple[str, ...] = ()
     splits: tuple[str, ...] = ()  # splits to import, e.g. train recovery; empty: all
     accept: bool = False  # exit code 0 in spite of notes
-    format: str = options.AUTO  # format, see starjax list; auto: detected
+    # lerobot, lerobot-v2.1, aloha, robomimic, zarr, rosbag, jigsaws or csv; auto: detected
+    format: str = options.AUTO
 
 
 def main(argv: Sequence[str]) -> int:

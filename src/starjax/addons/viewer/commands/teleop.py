@@ -50,6 +50,8 @@ class TeleopArgs:
     # additional input: a SpaceMouse (needs pyspacemouse) or a gamepad (needs pygame)
     device: Literal["none", "spacemouse", "gamepad"] = "none"
     port: Port = 8080  # port of the page, on this machine only; 0: a free one
+    # further names of this machine in a browser's address, such as that of a proxy
+    allow_host: tuple[str, ...] = ()
 
 
 def main(argv: Sequence[str]) -> int:
@@ -72,7 +74,7 @@ def main(argv: Sequence[str]) -> int:
         with (
             signals.stop_signals() as should_stop,
             recorder.record_into(Path(out), env, args.seed, policy) as kept,
-            page.serve(args.port) as server,
+            page.serve(args.port, names=args.allow_host) as server,
         ):
             print(f"open {page.address(server)} in a browser; Ctrl-C closes it", flush=True)
             summary = teleop.run(

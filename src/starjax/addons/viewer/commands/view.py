@@ -55,6 +55,8 @@ class ViewArgs:
     trocar: Annotated[int, Range(0, 999)] = 8  # index of the trocar configuration
     seed: config_lib.Seed = 0  # random seed of the trials
     port: Port = 8080  # port of the page, on this machine only; 0: a free one
+    # further names of this machine in a browser's address, such as that of a proxy
+    allow_host: tuple[str, ...] = ()
 
 
 def main(argv: Sequence[str]) -> int:
@@ -80,7 +82,8 @@ def main(argv: Sequence[str]) -> int:
         show = _recorded(args)
     else:
         show = _dataset(args.dataset, args.image_size) if args.dataset else _live(args)
-    with signals.stop_signals() as should_stop, page.serve(args.port) as server:
+    served = page.serve(args.port, names=args.allow_host)
+    with signals.stop_signals() as should_stop, served as server:
         print(f"open {page.address(server)} in a browser; Ctrl-C closes it", flush=True)
         print(show(server, should_stop))
     return 0
