@@ -7,7 +7,8 @@ SOURCE = pathlib.Path(__file__).parents[1] / "src" / "starjax"
 # From left to right; a layer may import itself and those of the rows before its own.
 ROWS = (
     ("errors", "moved"),
-    ("extensions", "extras", "types", "limits", "registry", "runtime"),
+    ("extras",),
+    ("extensions", "types", "limits", "registry", "runtime"),
     ("methods",),
     ("learners",),
     ("config", "rcm"),

@@ -50,7 +50,7 @@ def require(user: str, *extras: str) -> None:
 def install(wanted: str) -> str:
     """Returns the command that adds extras to this installation, from where it came.
 
-    `starjax` alone would name a package of an index, which may be somebody else's.
+    `starjax` alone would name a package of an index, which may have another owner.
     """
     checkout = pathlib.Path(__file__).parents[2]
     if (checkout / "pyproject.toml").is_file():

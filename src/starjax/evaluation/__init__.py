@@ -4,7 +4,7 @@ from typing import Any
 
 
 def __getattr__(name: str) -> Any:
-    """Imports `results` on first use: it needs jax, the disturbances beside it do not."""
+    """Imports `results` on first use, because it needs jax and the disturbances do not."""
     if name == "results":
         from starjax.evaluation import frame
 

@@ -2,7 +2,7 @@
 
 Angles are in degrees, rounded to 1e-4; results store radians. Columns, in order:
 
-    run, method, label, task, observation   the result's folder and what it scored
+    run, method, label, task, observation   folder, policy and scene of the result
     train_seed, seed                         of the training (None if unknown) and of the trials
     trocar, trial, seen                      identity of the trial
     success, loose, safe                     the three tests, success is the strict one

@@ -11,7 +11,7 @@ def results(argument: str, path: str | Path) -> list[Path]:
     """Returns the results that a path names: a file, the one in a folder, or those of its folders.
 
     Raises:
-      errors.UsageError: there is none.
+      errors.UsageError: the path has no result.
     """
     folder = Path(path).expanduser()
     files = [folder] if folder.is_file() else [folder / RESULT]

@@ -37,7 +37,7 @@ def identity(trial: Trial) -> tuple[int, int, int]:
 
 
 def paired(a: "Result", b: "Result", test: str = "success") -> Paired:
-    """Compares two results on the trials that both ran, in whatever order.
+    """Compares two results on the trials that both ran; their order is free.
 
     Args:
       a, b: from `result.read` or `result.read_sweep`.

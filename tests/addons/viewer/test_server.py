@@ -195,7 +195,7 @@ def test_unfinished_handshakes_are_dropped(page):
 
 def asked(port, host, origin=""):
     """Status and text of a request for the page."""
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=5)
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
     connection.putrequest("GET", "/", skip_host=True)
     connection.putheader("Host", host)
     if origin:
