@@ -4,7 +4,7 @@ import contextlib
 import http
 import ipaddress
 import socket
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from websockets.asyncio import server as sockets
@@ -89,10 +89,14 @@ def count(connection: sockets.ServerConnection) -> int:
 
 
 @contextlib.contextmanager
-def only_own_pages(names: Sequence[str] = ()) -> Iterator[None]:
+def only_own_pages(
+    names: Sequence[str] = (), adapt: Callable[[Any], Any] = lambda response: response
+) -> Iterator[None]:
     """Restricts websocket servers of other libraries that start within the context.
 
-    `names` are those of `refusal`.
+    Args:
+      names: see `refusal`.
+      adapt: response of the server to a request for a file -> the one that is sent.
     """
     original = sockets.serve
 
@@ -100,7 +104,8 @@ def only_own_pages(names: Sequence[str] = ()) -> Iterator[None]:
         def admit(connection: Any, request: Any) -> Any:
             if why := refusal(request, names):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, f"{why}\n")
-            return process_request(connection, request) if process_request else None
+            response = process_request(connection, request) if process_request else None
+            return response and adapt(response)
 
         limits = {"create_connection": limited(MAX_PAGES), "open_timeout": HANDSHAKE_S}
         return original(*args, process_request=admit, **options, **limits)

@@ -76,7 +76,7 @@ def test_a_pause_holds_and_a_step_is_one(page, expert, hurried, monkeypatch):
     counted = expert._replace(step=lambda *given: (taken.append(1), step(*given))[1])
     monkeypatch.setattr(simulation, "load", lambda who, arms=(): counted)
     asked = view.ViewOptions((simulation.expert("reach"),), seed=SEED)
-    presses = {0: lambda: press(page, "Play"), 3: lambda: press(page, "Step")}
+    presses = {0: lambda: press(page, "Play or pause"), 3: lambda: press(page, "Step")}
     view.run(page, asked, after(8, presses))
     assert len(taken) == 2  # the first one compiles, and is dropped
 
@@ -92,7 +92,7 @@ def test_the_page_says_that_it_compiles_and_that_it_pauses(page, expert, hurried
 
     monkeypatch.setattr(simulation, "load", lambda who, arms=(): expert._replace(step=recorded))
     asked = view.ViewOptions((simulation.expert("reach"),), seed=SEED)
-    view.run(page, asked, after(6, {2: lambda: press(page, "Play")}))
+    view.run(page, asked, after(6, {2: lambda: press(page, "Play or pause")}))
     assert at_first_step[0].startswith("Compiling") and "Compiling" not in at_first_step[-1]
     assert ", paused:" in shown[-1]
 
@@ -115,6 +115,49 @@ def test_a_dragged_trocar_stays_for_the_next_trial_until_another_is_selected(pag
     rollouts.begin(SEED, 8, 1)
     assert starts[0] is None and starts[1] is not None and starts[2] is None
     rollouts.remove()
+
+
+def widget(page, label):
+    """The dropdown or button group of a label."""
+    handles = page.gui._gui_input_handle_from_uuid.values()
+    return next(h for h in handles if h.label == label and hasattr(h, "options"))
+
+
+def test_an_own_trocar_is_shown_as_such_and_counted_apart(page, expert, hurried, monkeypatch):
+    monkeypatch.setattr(simulation, "load", lambda who, arms=(): expert)
+    made, shown = [], []
+    original = view.TrocarControls
+    monkeypatch.setattr(
+        view, "TrocarControls", lambda *given: made.append(original(*given)) or made[0]
+    )
+
+    def drag():
+        made[0]._handles._handles[0].position = (0.01, 0.02, 0.152)
+
+    def look():
+        shown.append((widget(page, "Trocar").value, made[0].is_own))
+
+    def choose():
+        widget(page, "Trocar").value = "3 (seen)"
+
+    asked = view.ViewOptions((simulation.expert("reach"),), trocar=2, seed=SEED)
+    acts = {1: look, 160: drag, 163: look, 480: look, 490: choose, 495: look}
+    said = view.run(page, asked, after(500, acts))
+    assert [own for _, own in shown] == [False, True, True, False]
+    names = [name for name, _ in shown]
+    assert names[0] == "2 (seen)" and names[1] == names[2] and "own" in names[1]
+    assert names[3] == "3 (seen)" and "own" not in str(widget(page, "Trocar").options)
+    first, own = said.split(" trials succeeded, at your own trocars ")
+    assert int(first.split()[-1]) >= 1 and int(own.split(";")[0].split()[-1]) >= 1
+
+
+def test_the_button_says_what_it_does(page):
+    player = pages.Player(page.gui, pages.UiRequests())
+    handles = list(page.gui._gui_input_handle_from_uuid.values())
+    group = next(h for h in handles[::-1] if "Step" in getattr(h, "options", ()))
+    assert player.is_playing and group.options[0] == "Pause"
+    press(page, "Play or pause")
+    assert not player.is_playing and group.options == ("Play", "Step", "Again", "Next")
 
 
 def directed(steered, trocar):

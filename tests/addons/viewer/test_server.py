@@ -1,9 +1,11 @@
 """The page's server and its handles, without a client."""
 
 import contextlib
+import gzip
 import http.client
 import pathlib
 import socket
+import urllib.request
 
 import numpy as np
 import pytest
@@ -222,3 +224,14 @@ def test_a_name_is_admitted_by_the_option_alone(page, host, origin):
         for other in ("evil.example.org", "lab.example.org.evil.org", "xlab.example.org"):
             assert asked(server.get_port(), other)[0] == 403
             assert asked(server.get_port(), "localhost", f"https://{other}")[0] == 403
+
+
+@pytest.mark.parametrize("encoding", ["identity", "gzip"])
+def test_the_page_has_our_title_and_the_systems_colours(page, encoding):
+    request = urllib.request.Request(pages.address(page), headers={"Accept-Encoding": encoding})
+    with urllib.request.urlopen(request, timeout=30) as response:
+        body = response.read()
+        assert len(body) == int(response.headers["Content-Length"])
+    text = (gzip.decompress(body) if encoding == "gzip" else body).decode()
+    assert text.count("<title>") == 1 and "<title>starjax</title>" in text
+    assert "prefers-color-scheme: dark" in text.partition("data-p=")[0]

@@ -221,7 +221,6 @@ def run(server: Any, recordings: Recordings, should_stop: Callable[[], bool]) ->
     player = page.Player(gui, requests)
     choices = page.Choices(gui, requests, episode=(keys, keys[0]))
     slider = gui.add_slider("Time (%)", 0.0, 100.0, 0.1, 0.0)
-    page.add_dark_mode(gui)
     # The loop moves the slider too: only a client's move is a request.
     slider.on_update(lambda event: requests.add("drag") if event.client is not None else None)
     episode.open(keys[0])

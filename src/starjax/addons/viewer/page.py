@@ -16,6 +16,7 @@ import numpy as np
 import scipy.ndimage
 
 from starjax import errors
+from starjax.addons.viewer import front
 
 HOST = "127.0.0.1"
 PORT = 8080
@@ -24,8 +25,9 @@ NOBODY = "nobody"
 REDRAW_STEPS = 3  # control steps between two pictures, plots and status lines
 PAUSED_S = 0.02  # between two polls of a paused page
 LATE = 1.0  # periods after which a step counts as missed
-_TEAL, _TEAL_ON_DARK = (0, 84, 74), (38, 166, 154)
+_TEAL = (0, 137, 123)  # on light and on dark paper
 _PANEL_WIDTH = 300  # pixels
+_PLAY, _PAUSE = "Play", "Pause"
 _NOTE_S = 5.0  # time that a note stays
 _STATUS_STYLE = "font-size:0.85em;line-height:1.5;padding:0 0.9em 0.4em"
 
@@ -50,35 +52,21 @@ def serve(
     from starjax.runtime import connections
 
     # viser prints a banner, and lets pages of other origins connect.
-    with contextlib.redirect_stdout(io.StringIO()), connections.only_own_pages(names):
+    with contextlib.redirect_stdout(io.StringIO()), connections.only_own_pages(names, front.adapt):
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
     try:
         # viser silently takes the next free port, which the user would not open.
         if port not in (ANY, server.get_port()):
             hint = "is another viewer open? --port 0 takes a free one"
             raise errors.UsageError("port", "a free port", port, hint)
-        _set_theme(server.gui, is_dark=False)
+        server.gui.configure_theme(
+            brand_color=_TEAL, show_logo=False, show_share_button=False, control_width="medium"
+        )
         server.gui.main_panel.dock_right()  # no handle of the scene lies under it
         yield server
     finally:
         with contextlib.redirect_stdout(io.StringIO()):
             server.stop()
-
-
-def _set_theme(gui: Any, is_dark: bool) -> None:
-    gui.configure_theme(
-        brand_color=_TEAL_ON_DARK if is_dark else _TEAL,
-        show_logo=False,
-        show_share_button=False,
-        control_width="medium",
-        dark_mode=is_dark,
-    )
-
-
-def add_dark_mode(gui: Any) -> None:
-    """Adds a box that makes the page dark."""
-    box = gui.add_checkbox("Dark", False)
-    box.on_update(lambda _: _set_theme(gui, is_dark=bool(box.value)))
 
 
 def address(server: Any) -> str:
@@ -159,15 +147,19 @@ class Player:
     def __init__(self, gui: Any, requests: UiRequests):
         self.is_playing = True
 
+        def play(is_playing: bool) -> None:
+            self.is_playing = is_playing
+            buttons.options = (_PAUSE if is_playing else _PLAY, *buttons.options[1:])
+
         def toggle() -> None:
-            self.is_playing = not self.is_playing
+            play(not self.is_playing)
 
         def step() -> None:
-            self.is_playing = False
+            play(False)
             requests.add("step")
 
         keys = {
-            "Play": (toggle, "space", "plays, or pauses"),
+            _PAUSE: (toggle, "space", "plays, or pauses"),
             "Step": (step, "S", "one control step"),
             "Again": (lambda: requests.add("again"), "A", "the same trial from its start"),
             "Next": (lambda: requests.add("next"), "N", "the next trial"),
@@ -175,9 +167,10 @@ class Player:
         hint = "; ".join(f"{key.capitalize()}: {text}" for _, key, text in keys.values())
         buttons = gui.add_button_group("", tuple(keys), hint=hint)
         self._speed = gui.add_slider("Speed", 0.1, 4.0, 0.1, 1.0)
-        buttons.on_click(lambda event: keys[event.target.value][0]())
+        calls = {label: call for label, (call, *_) in keys.items()} | {_PLAY: toggle}
+        buttons.on_click(lambda event: calls[event.target.value]())
         for label, (call, key, text) in keys.items():
-            add_command(gui, label, key, call, text)
+            add_command(gui, "Play or pause" if call is toggle else label, key, call, text)
 
     @property
     def speed(self) -> float:

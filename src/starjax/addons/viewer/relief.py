@@ -65,7 +65,6 @@ def run(
     names = trocar_names(env.task.name)
     choices = page.Choices(gui, requests, trocar=(names, names[trocar]))
     control = SharedControl(steering, shared_control.add_pilot(server, env), seed)
-    page.add_dark_mode(gui)
     steering.compile()  # before anything is recorded
     shown = _simulation(f"{label} and your hand", steering, control, recorder)
     rollouts = Rollouts(server, [shown], status, trocars=FixedTrocars(), is_compiled=True)

@@ -108,7 +108,6 @@ def run(
     names = trocar_names(env.task.name)
     choices = page.Choices(gui, requests, trocar=(names, names[trocar]))
     pilot = shared_control.add_pilot(server, env, device)
-    page.add_dark_mode(gui)
     steering.compile()  # not after the operator's first motion
     episode = OperatorEpisode(server, steering, pilot, seed)
 

@@ -24,7 +24,11 @@ _spherical, _position = jax.jit(rcm.trocar_from_position), jax.jit(rcm.trocar_po
 
 
 class TrocarControls:
-    """Handles and sliders of a task's trocars, which follow each other."""
+    """Handles and sliders of a task's trocars, which follow each other.
+
+    Attributes:
+      is_own: the operator has moved a trocar since the last `release`.
+    """
 
     def __init__(self, server: Any, task: Task):
         self._task, self._requests = task, page.UiRequests()
@@ -40,7 +44,7 @@ class TrocarControls:
             self._folders.append(folder)
         self._button = gui.add_button("Random trocar", hint="as in the training's Eq. 19")
         self._button.on_click(lambda _: self._requests.add("random"))
-        self._is_own = False
+        self.is_own = False
 
     def place(self, p_world_trocar: np.ndarray) -> None:
         """Moves everything to the trocars `[A, 3]` m of a trial's start."""
@@ -49,11 +53,11 @@ class TrocarControls:
 
     def release(self) -> None:
         """Gives up the operator's own trocars."""
-        self._is_own = False
+        self.is_own = False
 
     def own(self) -> Trocar | None:
         """Returns the operator's own trocars, fields `[A]`, None without any."""
-        if not self._is_own:
+        if not self.is_own:
             return None
         return Trocar(*map(np.asarray, _spherical(self._handles.target(), self._p_world_ref)))
 
@@ -65,7 +69,7 @@ class TrocarControls:
             self._handles.place(np.asarray(_position(trocar, self._p_world_ref)))
         p = self._handles.target()
         if requested or not np.array_equal(p, self._shown):
-            self._is_own = True
+            self.is_own = True
             self._show(p)
         return p
 

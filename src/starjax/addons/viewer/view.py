@@ -18,6 +18,7 @@ from starjax.addons.viewer.trocar_controls import TrocarControls
 from starjax.sim import registries
 
 OWN_ARMS = "their own"
+_OWN_TROCAR = "own, as you moved it"
 _COMPILING = "Compiling {}\nAbout a minute the first time, seconds later."
 _HAND = "No hand", "starjax view --policy NAME --record DIR lets T pass control to your hand."
 REST_S = 1.5  # pause between an episode and the next trial
@@ -48,19 +49,20 @@ def run(server: Any, options: ViewOptions, should_stop: Callable[[], bool]) -> s
     player = page.Player(server.gui, requests)
     selection = Selection(server.gui, requests, options)
     page.add_command(server.gui, "Pass control", "T", lambda: page.notify(server, *_HAND))
-    page.add_dark_mode(server.gui)
     rollouts = _load(server, selection, status, options.sweep)
     rollouts.begin(options.seed, selection.trocar, 0)
     clock = page.Clock(rollouts.hz)
     while not should_stop():
         requested = requests.pop()
         if "choice" in requested:
-            clock.pause()
-            if selection.is_changed():
+            is_changed = selection.is_changed()
+            if is_changed:
                 rollouts.remove()
                 rollouts = _load(server, selection, status, options.sweep)
-            rollouts.trocars.release()
-            rollouts.begin(options.seed, selection.trocar, 0)
+            if is_changed or not selection.is_own:
+                clock.pause()
+                rollouts.trocars.release()
+                rollouts.begin(options.seed, selection.trocar, 0)
         elif requested & {"again", "next"}:
             clock.pause()
             trial = rollouts.trial + ("next" in requested)
@@ -73,6 +75,7 @@ def run(server: Any, options: ViewOptions, should_stop: Callable[[], bool]) -> s
         else:
             clock.pause()
             rollouts.idle()
+        selection.show_trocar(rollouts.trocars.is_own)
     return f"{rollouts.summary()}; {clock.missed} of {clock.steps} control steps late"
 
 
@@ -94,11 +97,27 @@ class Selection:
             trocar=(trocars, trocars[options.trocar]),
         )
         self._before = self._values()
+        self._trocar, self._offers_own = options.trocar, False
 
     @property
     def trocar(self) -> int:
-        """Index of the task's trocar configuration."""
-        return int(self._choices["trocar"].split()[0])
+        """Index of the task's trocar configuration, of the last one at the operator's own place."""
+        if not self.is_own:
+            self._trocar = int(self._choices["trocar"].split()[0])
+        return self._trocar
+
+    @property
+    def is_own(self) -> bool:
+        """True if the dropdown shows the operator's own trocar."""
+        return self._choices["trocar"] == _OWN_TROCAR
+
+    def show_trocar(self, is_own: bool) -> None:
+        """Shows the operator's own trocar, or the configuration, in the dropdown."""
+        if is_own != self._offers_own:
+            self._offers_own = is_own
+            names = trocar_names(self._choices["task"])
+            shown = _OWN_TROCAR if is_own else names[self.trocar]
+            self._choices.offer("trocar", [*names, *[_OWN_TROCAR] * is_own], shown)
 
     @property
     def arms(self) -> tuple[str, ...]:
@@ -119,6 +138,7 @@ class Selection:
             self._choices.offer("agent", names, names[0])
             self._choices.offer("compare_with", (page.NOBODY, *names), page.NOBODY)
             self._choices.offer("trocar", trocars, trocars[0])
+            self._trocar, self._offers_own = 0, False
         before, self._before = self._before, self._values()
         return before != self._before
 
@@ -167,7 +187,8 @@ class Rollouts:
             self._plots = Plots(gui, labels, self.hz)
             self._pictures = page.Pictures(gui, [f"{label} sees" for label in labels])
         self._alarms = [EpisodeAlarm(simulation.monitor) for simulation in simulations]
-        self._tally = np.zeros((len(simulations), 2), int)  # succeeded, ended
+        # Succeeded and ended trials, at the task's trocars and at the operator's own.
+        self._tally = np.zeros((len(simulations), 2, 2), int)
         self._is_compiled, self._is_paused = is_compiled, False
 
     def begin(self, seed: int, configuration: int, trial: int) -> None:
@@ -197,7 +218,8 @@ class Rollouts:
             self._states[i], frame = self._simulations[i].step(self._states[i], target)
             self._alarms[i].update(self._frames[i], self._states[i])
             self._frames[i], self._outcomes[i] = frame, outcome(frame, frame.step >= self._limit)
-            self._tally[i] += bool(frame.success), bool(self._outcomes[i])
+            is_own = int(self.trocars.own() is not None)
+            self._tally[i, is_own] += bool(frame.success), bool(self._outcomes[i])
         is_due = self._frames[0].step % page.REDRAW_STEPS == 0
         self._draw(with_images=is_due or all(self._outcomes))
         return False
@@ -213,8 +235,8 @@ class Rollouts:
     def summary(self) -> str:
         """Returns the success so far."""
         return "; ".join(
-            f"{simulation.label}: {successes} of {ended} trials succeeded"
-            for simulation, (successes, ended) in zip(self._simulations, self._tally)
+            f"{simulation.label}: {successes} of {ended} trials succeeded{_at_own(own)}"
+            for simulation, ((successes, ended), own) in zip(self._simulations, self._tally)
         )
 
     def remove(self) -> None:
@@ -247,15 +269,21 @@ class Rollouts:
         self._status.set("\n\n".join(map(self._line, range(len(self._stages)))))
 
     def _line(self, i: int) -> str:
-        frame, (successes, ended) = self._frames[i], self._tally[i]
+        frame, ((successes, ended), own) = self._frames[i], self._tally[i]
         progress = self._outcomes[i] or self._simulations[i].env.task.stages[int(frame.stage)]
         lines = [
             f"{self._simulations[i].label}, trial {self.trial}{', paused' * self._is_paused}: "
             f"{frame.step / self.hz:.1f} s, {progress}",
-            f"RCM error {rcm_error_mm(frame):.2f} mm; success so far: {successes} of {ended}",
+            f"RCM error {rcm_error_mm(frame):.2f} mm; success so far: {successes} of {ended}"
+            f"{_at_own(own)}",
             self._alarms[i].text,
         ]
         return "\n".join(filter(None, lines))
+
+
+def _at_own(tally: np.ndarray) -> str:
+    """Returns the count of trials at the operator's own trocars, empty without any."""
+    return f", at your own trocars {tally[0]} of {tally[1]}" if tally[1] else ""
 
 
 def _load(
