@@ -1,13 +1,11 @@
-"""The page of files names every field that is written, and the helps every format."""
+"""The page of files names every field that is written."""
 
 import json
 import re
 
-import pytest
 import synthetic
 
 from starjax import cli
-from starjax.addons.formats import base
 from starjax.evaluation import content
 
 
@@ -30,18 +28,6 @@ def test_every_key_of_a_result_is_described(pytestconfig, tmp_path):
 
 def test_every_field_of_a_trial_is_described(pytestconfig):
     assert named(pytestconfig, "### A trial") == {"field", *content.Trial._fields} - {"field"}
-
-
-@pytest.mark.parametrize(
-    ("command", "names"), [("export", base.writable), ("import", base.FORMATS.names)]
-)
-def test_help_names_every_format(command, names, capsys):
-    with pytest.raises(SystemExit):
-        cli.dispatch([command, "--help-all"])
-    shown = capsys.readouterr().out.replace("│", " ").split("--format STR")[1].split("--")[0]
-    words = set(re.findall(r"[a-z][\w.-]*\w", shown))
-    assert set(names()) <= words
-    assert set(base.FORMATS.names()) & words == set(names())
 
 
 def test_the_arms_alone_have_their_mounts(capsys):
