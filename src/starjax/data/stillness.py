@@ -24,7 +24,7 @@ PART = 1e-3  # of its range in an episode, by which a number of unknown unit mov
 
 
 def is_still(before: Command, after: Command) -> Any:
-    """Returns True `[...]` where no tip, axis or jaw of arms `[..., A]` moves between commands.
+    """Returns True `[...]` if no tip, axis or jaw of arms `[..., A]` moves between two commands.
 
     Works on numpy and on jax arrays alike.
     """

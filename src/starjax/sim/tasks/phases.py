@@ -22,7 +22,7 @@ RAISE, APPROACH, DESCEND = range(3)  # the first phases of every script
 ALIGNED = 0.6  # fraction of a descent after which the tool goes straight down
 TURN_LEAD = 0.25  # s before the end of the approach at which the tool begins to turn
 TURN_TIME = 0.80  # s the turn takes
-# m that a tool rises on slowly in a second while the judge waits, so that it never stands still
+# m that a tool rises on slowly in a second while the judge waits: it never stands still
 RISE = 0.004
 RISEN = 0.0005  # m below its height, from which a tool has risen
 

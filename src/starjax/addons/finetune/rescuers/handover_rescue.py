@@ -91,7 +91,7 @@ def before_the_pass(
     off, starts = now.p - grasps, jnp.stack([goals[above, 0], goals[near, 1]]) - grasps
     is_coming = _is_above(off, starts, state) & (now.jaws > 0.0)
     is_about = jnp.linalg.norm(off, axis=-1) < ASIDE
-    # Jaws that are sent to close, but have not yet, go on.
+    # Jaws that are sent to close, but have not yet, continue.
     is_shutting = (now.jaws <= -midway.OPEN) & ~state.touch & (state.gripper > EMPTY)
     is_closing = is_about & ((jnp.abs(now.jaws) < midway.OPEN) | is_shutting)
     is_slow = jnp.linalg.norm(state.velocity[0, :3]) < way_in.SLOW
