@@ -1,4 +1,4 @@
-"""How fast examples/ppo.py learns reach, from several seeds.
+"""How fast examples/11_ppo.py learns reach, from several seeds.
 
 python benchmarks/bench_ppo.py [--seeds 3] [the example's own flags]
 """
@@ -12,7 +12,7 @@ from typing import Any
 
 import _timing
 
-EXAMPLE = Path(__file__).parents[1] / "examples" / "ppo.py"
+EXAMPLE = Path(__file__).parents[1] / "examples" / "11_ppo.py"
 
 
 def main() -> None:

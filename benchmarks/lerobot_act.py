@@ -5,7 +5,7 @@ r"""No time: trains LeRobot's ACT on an export of states, for a row of the troca
         --demos.per-trocar 100 --out runs/reach
     starjax export runs/reach/demos-DIGEST export --state-with-trocar --actions rcm4 --image-size 0
     python benchmarks/lerobot_act.py export checkpoint
-    python examples/serve_lerobot.py checkpoint --task reach
+    python examples/14_serve_lerobot.py checkpoint --task reach
     starjax evaluate --policy ws://127.0.0.1:8000 --benchmark --no-video
 
 Policy, normalisation and optimiser are LeRobot's. Its loader reads rows one by one, which takes a

@@ -5,6 +5,7 @@ NAME in place of the mark, a paragraph of one link to a film becomes a player, a
 `math`, which code hosts set, becomes MathML.
 """
 
+import ast
 import re
 import sys
 from pathlib import Path
@@ -31,6 +32,7 @@ COPIES = {
     "reference/mjcf.md": "mjcf/README.md",
     "results/index.md": "experiments/README.md",
 } | {f"results/{page.name}.md": f"experiments/{page.name}/README.md" for page in claims.pages()}
+EXAMPLES = {f"examples/{file.stem}.md": file for file in sorted((ROOT / "examples").glob("*.py"))}
 GENERATED = {
     "commands": settings.commands,
     "settings": settings.settings,
@@ -44,7 +46,8 @@ _PLAYER = '<video{} controls muted playsinline preload="metadata" src="{}" aria-
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Lists the pages of results in the navigation, in the order of the paper."""
+    """Lists the examples and, in the order of the paper, the results in the navigation."""
+    config.nav.insert(2, {"Examples": list(EXAMPLES)})
     groups = [
         {group: [f"results/{name}.md" for name in names]} for group, names in claims.GROUPS.items()
     ]
@@ -57,6 +60,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for page, source in COPIES.items():
         text = relinked((ROOT / source).read_text(), ROOT / source, page)
         files.append(File.generated(config, page, content=text))
+    for page, source in EXAMPLES.items():
+        files.append(File.generated(config, page, content=example(source)))
     for image in (path for path in RESULTS.rglob("*") if path.suffix in IMAGES):
         name = f"results/{image.relative_to(RESULTS).as_posix()}"
         files.append(File.generated(config, name, abs_src_path=str(image)))
@@ -66,12 +71,28 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Rewrites links, fills generated tables in, and sets films and equations."""
     source = ROOT / "docs" / page.file.src_uri
-    if page.file.src_uri not in COPIES:
+    if page.file.src_uri not in COPIES | EXAMPLES:
         markdown = relinked(markdown, source, page.file.src_uri)
     markdown = _MARK.sub(lambda match: GENERATED[match[1]](), markdown)
     markdown = _MATH.sub(lambda match: converter.convert(match[1], display="block"), markdown)
     place = ' class="at-right"' if page.is_homepage else ""
     return _FILM.sub(lambda match: _PLAYER.format(place, match[2], match[1]), markdown)
+
+
+def example(source: Path) -> str:
+    """Returns the page of an example: its docstring, its command and its code."""
+    text = source.read_text()
+    head, _, rest = (ast.get_docstring(ast.parse(text)) or "").partition("\n\n")
+    number, _, name = source.stem.partition("_")
+    code = text.split('"""', 2)[2].strip()
+    parts = [
+        "---",
+        f"title: {int(number)}. {name.replace('_', ' ')}",
+        "---",
+        f"# {head.rstrip('.')}",
+    ]
+    parts += ["", rest, "", f"```bash\npython examples/{source.name}\n```"]
+    return "\n".join([*parts, "", f"```python\n{code}\n```", ""])
 
 
 def relinked(text: str, source: Path, page: str) -> str:
@@ -82,7 +103,7 @@ def relinked(text: str, source: Path, page: str) -> str:
       source: its file.
       page: its path in the site, relative to `docs/`.
     """
-    pages = {(ROOT / path).resolve(): name for name, path in COPIES.items()}
+    pages = {(ROOT / path).resolve(): name for name, path in (COPIES | EXAMPLES).items()}
     up = "../" * page.count("/")
 
     def link(match: re.Match) -> str:

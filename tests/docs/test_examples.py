@@ -6,9 +6,9 @@ import runpy
 import matplotlib.pyplot as plt
 import pytest
 
-SHORT = {"ppo": ["--envs", "4", "--iterations", "2"]}
-SLOW = {"closed_loop", "far_robot", "ppo"}  # compile the simulation, a server
-PEERS = {"serve_lerobot"}  # needs LeRobot: tests/addons/peers/lerobot_closed_loop.py runs it
+SHORT = {"11_ppo": ["--envs", "4", "--iterations", "2"]}
+SLOW = {"04_closed_loop", "06_far_robot", "11_ppo", "12_export"}  # compile, or start a server
+PEERS = {"14_serve_lerobot"}  # needs LeRobot: tests/addons/peers/lerobot_closed_loop.py runs it
 
 
 def pytest_generate_tests(metafunc):

@@ -26,7 +26,7 @@ EDIT = """-m lerobot.scripts.lerobot_edit_dataset --repo_id me/demos --root {0}/
 --new_repo_id me/cut --new_root {0}/cut --operation.type delete_episodes
 --operation.episode_indices [1]"""
 CHECKPOINT = "train/checkpoints/last/pretrained_model"
-SERVE = "{1}/examples/serve_lerobot.py {0}/{2} --port 0"
+SERVE = "{1}/examples/14_serve_lerobot.py {0}/{2} --port 0"
 EVAL = """-m lerobot.scripts.lerobot_eval --policy.path={0}/{2} --policy.device=cpu
 --env.type=starjax --env.image_size={3} --env.trocar_in_state=true --env.actions=rcm4
 --env.trocars=seen --env.max_episode_steps=10 --eval.batch_size=2 --eval.n_episodes=2

@@ -28,7 +28,7 @@ from starjax.runtime import provenance
 
 GAMMA = 0.9
 # Noise begins small: see docs/use/reinforcement-learning.md. Steps and batches are those of
-# examples/ppo.py.
+# examples/11_ppo.py.
 LEARNERS = {
     "sac": (
         SAC,

@@ -1,7 +1,7 @@
 """Learns a task by proximal policy optimisation; an iteration is one compiled program.
 
-    python examples/ppo.py                                               # a CPU
-    python examples/ppo.py --envs 4096 --iterations 60 --minibatches 32   # a GPU
+    python examples/11_ppo.py                                               # a CPU
+    python examples/11_ppo.py --envs 4096 --iterations 60 --minibatches 32   # a GPU
 
 Needs optax, flax, jax and mujoco-mjx. Prints the learning curve as one JSON object per line, with
 the success rate of the mean action.

@@ -1,7 +1,7 @@
 """Serves a checkpoint of LeRobot in openpi's protocol, for `starjax evaluate --policy ws://...`.
 
     pip install 'lerobot>=0.6' 'starjax[serve,sim]'
-    python examples/serve_lerobot.py outputs/train/.../pretrained_model --task peg_transfer
+    python examples/14_serve_lerobot.py outputs/train/.../pretrained_model --task peg_transfer
 
 Its policy was trained on `starjax export`. What it observes (the trocar as part of the state or
 not, which camera, which size) and what it commands (poses or rcm4) is read off its features.
