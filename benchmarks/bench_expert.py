@@ -5,8 +5,8 @@
         [--disturbance cable_slack=1]
     python benchmarks/bench_expert.py --all OUT.json [--workers 4] [--only TEXT ...]
 
-`--all` runs every expert of the registry and those of `OTHERS`, several at once, and tests what
-each owes: no success collided, no invalid episode, and no rest before the judge's last settle.
+`--all` runs every expert of the registry and those of `OTHERS`, several at once, and tests
+them: no success collided, no episode invalid, and no rest before the judge's last settle.
 Committed figures of the built-in experts; `starjax check TASK` checks any expert.
 """
 
@@ -102,7 +102,7 @@ def _row(asked: argparse.Namespace, row: tuple[str, str, str, str]) -> tuple[str
             "rests": sum(part["resting"] > stillness.RARELY * part["successes"] for part in parts),
         }
         results["faults"] = [fault for fault, count in faults.items() if count]
-    except Exception as error:  # the other rows go on
+    except Exception as error:  # the other rows continue
         results = {"faults": [f"{type(error).__name__}: {error}"]}
     found = [f"{part}: {_text(results[part])}" for part in ("twelve", "eq19") if part in results]
     seconds = f"{time.perf_counter() - start:.0f} s"

@@ -234,6 +234,7 @@ def one_tool(tip: Pose, measurements: Any, layout: Any) -> types.SimpleNamespace
         layout=layout,
         measured_trocar=measured_above(),
         gripper_target=-jnp.ones(1),
+        gripper=-0.5 * jnp.ones(1),
         touch=jnp.ones(1, bool),
         step=jnp.asarray(50),
     )

@@ -20,7 +20,7 @@ SLOPE = 0.15  # of a way's time, at either end, in which its speed changes
 JAW_TIME = 0.25  # s to close or open
 JAW_DELAY = 2.0 / CONTROL_HZ  # s, for which jaws are waited for at most
 SHUT = 0.0  # opening below which jaws that touch something have it between them
-OPENED = 0.8  # opening from which jaws are clear of what they held
+OPENED = 0.8  # opening from which jaws are clear of an object
 
 
 def sloped(fraction: jax.Array) -> jax.Array:
