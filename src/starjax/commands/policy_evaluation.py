@@ -22,6 +22,7 @@ from starjax.policies import features, in_env, policy_file
 from starjax.policies import policy as policies
 from starjax.policies.in_env import PolicyInEnv
 from starjax.rollouts import placement
+from starjax.runtime.precompile import Program
 from starjax.sim.state import Env
 
 if TYPE_CHECKING:
@@ -121,7 +122,7 @@ def precompile(
     """
     row, deciding = methods.METHODS[name], config_lib.inference_settings(config.policy)
     policy = policies.make(row, deciding, env.task, cameras=env.names.cameras)
-    params = jax.eval_shape(policy.init, jax.random.key(0))
+    params = Program(policy.init).shapes(jax.random.key(0))
     if vision is not None:
         params = {**params, "vision": vision}
     params = jax.eval_shape(policy.prepare_for_inference, params)

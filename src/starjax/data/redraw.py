@@ -257,7 +257,7 @@ def _keys(description: Mapping[str, Any], records: Sequence[Mapping[str, Any]]) 
         return jax.random.split(key)[0]
 
     numbers = np.array([(record["trocar"], record["trial"]) for record in records], np.int32)
-    return jax.vmap(one)(*numbers.T)
+    return jax.jit(jax.vmap(one))(*numbers.T)
 
 
 def batch_size() -> int:

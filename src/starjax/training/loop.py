@@ -112,7 +112,7 @@ def run(
     draws = is_new and given is None
     drawn = background.run_in_background(init.drawn) if draws else init.drawn
     shapes = states.shapes(
-        policy, optimizer, init.traced.out_info, stats, streams.steps, devices.replicated(mesh)
+        policy, optimizer, init.shapes, stats, streams.steps, devices.replicated(mesh)
     )
     layout = StateLayout(mesh, policy.cast_params, shapes)
     setup = Setup(policy, optimizer, policy_config, train_config, layout)

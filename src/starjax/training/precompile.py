@@ -52,7 +52,7 @@ def step_program(
     shapes = states.shapes(
         policy,
         optimizer,
-        jax.eval_shape(policy.init, key),
+        precompile.Program(policy.init).shapes(key),
         normalizer.shapes(row, task, by_state),
         key,
         devices.replicated(mesh),

@@ -12,8 +12,10 @@ import optax
 from starjax import config
 from starjax.data import normalizer
 from starjax.policies.base import Params, Policy
-from starjax.runtime import garbage
+from starjax.runtime.precompile import Program
 from starjax.training import metrics
+
+_QUICK = {"xla_backend_optimization_level": 0}
 
 
 class Streams(NamedTuple):
@@ -111,16 +113,18 @@ class Init(NamedTuple):
     """A policy's first parameters, traced but not yet drawn.
 
     Attributes:
-      traced: the program; its `out_info` has the shapes.
+      program: from a key to the parameters.
       key: its argument.
+      shapes: of the parameters.
     """
 
-    traced: jax.stages.Traced
+    program: Program
     key: jax.Array
+    shapes: Params
 
     def drawn(self) -> Params:
         """Draws the parameters; they stay on the device of the key."""
-        return jax.block_until_ready(self.traced.lower().compile()(self.key))
+        return jax.block_until_ready(self.program(self.key))
 
 
 def on_device(params: Params) -> Params:
@@ -138,8 +142,8 @@ def init(policy: Policy, key: jax.Array) -> Init:
     except RuntimeError:  # JAX_PLATFORMS leaves it out
         place = jax.local_devices()[0]
     key = jax.device_put(key, place)
-    with garbage.gc_paused():
-        return Init(_quick(policy.init).trace(key), key)
+    program = Program(policy.init, compiler_options=_QUICK)
+    return Init(program, key, program.shapes(key))
 
 
 def run_once(fn: Callable[..., Any], *args: Any) -> Any:
@@ -147,11 +151,7 @@ def run_once(fn: Callable[..., Any], *args: Any) -> Any:
 
     Called as it is, `fn` would compile a hundred programs, one per small array.
     """
-    return _quick(fn)(*args)
-
-
-def _quick(fn: Callable[..., Any]) -> Any:
-    return jax.jit(fn, compiler_options={"xla_backend_optimization_level": 0})
+    return Program(fn, compiler_options=_QUICK)(*args)
 
 
 def create(
