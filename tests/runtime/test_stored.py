@@ -6,6 +6,7 @@ import itertools
 import os
 import subprocess
 import sys
+import time
 from typing import Any
 
 import flax.struct
@@ -33,13 +34,17 @@ class State:
     unit: str = flax.struct.field(pytree_node=False, default="mm")
 
 
+def half(x):
+    return 0.5 * x
+
+
 def steps(count, factor):
     def run(state, scale):
         TRACES.append(1)
         key, sub = jax.random.split(state.key)
 
         def body(i, x):
-            return 0.5 * x + scale * jax.random.normal(sub, x.shape)
+            return half(x) + scale * jax.random.normal(sub, x.shape)
 
         x = jax.lax.fori_loop(0, count, body, factor * state.x)
         return state.replace(key=key, x=x), {"sum": jnp.sum(x), "none": None}
@@ -71,6 +76,7 @@ def folder(tmp_path, monkeypatch):
 @pytest.fixture
 def part(tmp_path, monkeypatch):
     (tmp_path / "part.py").write_text(PART)
+    monkeypatch.setattr(package_files, "_started", time.time() + 3600)
     monkeypatch.syspath_prepend(tmp_path)
     yield importlib.import_module("part")
     del sys.modules["part"]
@@ -134,6 +140,7 @@ def test_any_change_is_traced_again(folder, part, tmp_path, monkeypatch):
         patch.setattr(jax.local_devices()[0].__class__, "device_kind", "another", raising=False)
         forget_sources()
         assert [call(part)[0] for _ in range(2)] == [1, 0]
+    # A global's code, which is in no closure.
     (tmp_path / "part.py").write_text(PART.replace("0.5 * x", "0.6 * x"))
     forget_sources()
     edited = importlib.reload(part)
@@ -154,7 +161,14 @@ def test_an_edit_of_starjax_is_traced_again(folder, part, monkeypatch):
     assert [call(part)[0] for _ in range(2)] == [1, 0]
 
 
+def test_an_edit_after_the_start_is_no_key(folder, part, monkeypatch):
+    monkeypatch.setattr(package_files, "_started", time.time() - 3600)
+    assert [call(part)[0] for _ in range(2)] == [1, 1]
+    assert not folder.exists()
+
+
 def test_packages_that_a_part_uses_count_and_installed_ones_do_not(tmp_path, monkeypatch):
+    monkeypatch.setattr(package_files, "_started", time.time() + 3600)
     (tmp_path / "tool_part").mkdir()
     (tmp_path / "tool_part" / "__init__.py").write_text("from help_part import width\n")
     (tmp_path / "tool_part" / "tool.xml").write_text("<mujoco/>")

@@ -22,8 +22,6 @@ _BY_REPR = (
     np.dtype, jax.ShapeDtypeStruct, jax.sharding.Mesh, jax.sharding.PartitionSpec,
     jax.sharding.Sharding,
 )  # fmt: skip
-# Their functions are in no file that could be read, and see variables that change.
-_INTERACTIVE = ("__main__", "__mp_main__")
 
 
 class Unknown(TypeError):
@@ -46,7 +44,7 @@ def of(*objects: Any) -> Content:
     """Returns the content of objects: constants, containers, arrays, functions with closures.
 
     Raises:
-      Unknown: one holds an object of another kind, or a function of a script or a notebook.
+      Unknown: one holds an object of another kind.
     """
     walk = _Walk()
     for x in objects:
@@ -138,8 +136,6 @@ class _Walk:
 
     def _name(self, x: Any) -> str:
         module = getattr(x, "__module__", None) or "builtins"
-        if module in _INTERACTIVE:
-            raise Unknown(f"{x!r:.80} of a script or a notebook")
         self.modules.add(module)
         return f"{module}:{getattr(x, '__qualname__', x.__name__)}"
 

@@ -5,6 +5,7 @@ import hashlib
 import importlib.metadata
 import importlib.util
 import sys
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
@@ -12,10 +13,11 @@ from typing import Any
 
 _SUFFIXES = (".py", ".xml", ".toml", ".json")
 _INSTALLED = {"site-packages", "dist-packages"}
+_started = time.time()  # of this process, about
 
 
 class Missing(LookupError):
-    """A package whose files are not known."""
+    """A package whose files are not those of its code."""
 
 
 def digests(modules: Iterable[str]) -> dict[str, str]:
@@ -25,7 +27,7 @@ def digests(modules: Iterable[str]) -> dict[str, str]:
     starjax.
 
     Raises:
-      Missing: one has no files.
+      Missing: one has no files, or was edited since this process imported it.
     """
     waiting, total = {name.partition(".")[0] for name in modules}, {}
     while waiting:
@@ -50,12 +52,14 @@ def _files(package: str) -> tuple[Path, ...]:
         return ()
     try:
         spec = importlib.util.find_spec(package)
-    except ValueError:  # its module was made by hand
+    except ValueError:  # of a script, a notebook, or made by hand
         spec = None
     if spec is None or not (places := spec.submodule_search_locations or [spec.origin or ""]):
         raise Missing(f"no files of {package}")
     roots = [Path(place) for place in places]
-    if package not in providers() and any(_INSTALLED & {*root.parts} for root in roots):
+    if package not in {"starjax", *providers()} and any(
+        _INSTALLED & {*root.parts} for root in roots
+    ):
         return ()
     inside = (path for root in roots for path in [root, *root.rglob("*")])
     return tuple(sorted(path for path in inside if path.suffix in _SUFFIXES))
@@ -67,6 +71,8 @@ def _digest(files: tuple[Path, ...]) -> str:
     total = hashlib.sha256()
     for path in files:
         content = path.read_bytes()
+        if path.stat().st_ctime > _started:
+            raise Missing(f"{path} changed since the start")
         total.update(f"{path.name} {len(content)}\n".encode() + content)
     return total.hexdigest()
 

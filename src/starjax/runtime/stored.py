@@ -187,7 +187,8 @@ def are_cached() -> bool:
 def _sources(device: jax.Device) -> str:
     """Returns the digest of all that every program on a device depends on."""
     packages = sorted((d.name, d.version) for d in importlib.metadata.distributions())
-    about = device.platform, device.device_kind, device.client.platform_version
+    kind = jax.default_backend(), device.platform, device.device_kind
+    about = *kind, device.client.platform_version
     code = package_files.digests({"starjax", *package_files.providers()})
     text = repr((about, sys.version, xla.flags(), packages, code))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
