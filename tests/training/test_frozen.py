@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import stubs
 
 from starjax import config
 from starjax.commands import demonstrations, folders, pipeline, presets
@@ -252,8 +253,9 @@ def test_a_run_reads_pictures_for_the_features_alone(source, dataset, tmp_path, 
     images = {"camera": np.asarray(dataset.observation.images["camera"])}
     monkeypatch.setattr(load, "frames", lambda root, env: images)
     settings, found = source
+    env = stubs.make_env("image")
     loaded = demonstrations.load(
-        run_config(settings, tmp_path), None, tmp_path, lambda: None, found, sharing.ALONE
+        run_config(settings, tmp_path), env, tmp_path, lambda: None, found, sharing.ALONE
     )
     assert loaded.observation.images is None and windows.on_device(loaded)
     wanted = features(source, dataset, tmp_path / "other")
