@@ -1,6 +1,7 @@
 """A robot's loop whatever the network does: which command is next, and none is a jump."""
 
 import collections
+import contextlib
 import dataclasses
 import socket
 import threading
@@ -11,6 +12,7 @@ import mistakes
 import numpy as np
 import pytest
 import served
+from scipy.spatial.transform import Rotation
 
 from starjax import deploy, rcm
 from starjax.deploy import batching, connection_pool, plan_executor, wire
@@ -431,3 +433,109 @@ def test_a_proxy_of_the_environment_is_not_used(batches, monkeypatch):
             address = f"ws://{where[0]}:{where[1]}"
             pool = connection_pool.ConnectionPool(address, served.KEY)
             assert pool.metadata["method"] == "stardiff"
+
+
+def moved_on(batches, **options):
+    """A robot that is on its way, its client, and the end of both."""
+    stack = contextlib.ExitStack()
+    where, _ = stack.enter_context(served.running(batches))
+    client = stack.enter_context(client_of(where, **options))
+    robot = Robot()
+    assert driven_until(lambda: client.report.plans > 0, client, robot)
+    return stack, client, robot
+
+
+def elsewhere(pose, angle=0.25):
+    """The same tool, turned about the trocar."""
+    R = np.array(Rotation.from_rotvec([angle, 0.0, 0.0]).as_matrix(), np.float32)
+    return Pose(R @ pose.R, WHERE + R @ (pose.p - WHERE))
+
+
+def test_an_arm_that_comes_back_elsewhere_waits_for_a_person(batches):
+    stack, client, robot = moved_on(batches)
+    with stack:
+        sent = len(robot.commands)
+        robot.seen = robot.seen.replace(pose=elsewhere(robot.seen.pose))
+        assert np.linalg.norm(robot.seen.pose.p - robot.commands[-1].pose.p) > 0.01
+        client.run(robot, 1.0)  # its program is there again: nothing is sent
+        assert len(robot.commands) == sent and client.report.silent == 30
+        assert client.report.fault.startswith("following") and client.report.plans >= 1
+        client.restart(robot.measure())
+        first = client.step(robot.measure())
+        assert np.linalg.norm(first.pose.p - robot.seen.pose.p) < 1e-4
+        robot.send(first)
+        plans = client.report.plans
+        assert driven_until(lambda: client.report.plans > plans, client, robot)
+        steps = np.diff([one.pose.p for one in list(robot.commands)[sent:]], axis=0)
+        assert np.linalg.norm(steps, axis=-1).max() <= deploy.Limits().per_step[0] * (1 + 1e-4)
+
+
+def test_a_plan_from_before_a_restart_is_not_executed():
+    executor = plan_executor.PlanExecutor(WHERE, HORIZON, EXECUTE, None, deploy.Limits())
+    executor.begin(poses(0.0, 0.1), 1.0)
+    executor.on_request()
+    executor.forget()
+    assert executor.last is None
+    executor.begin(poses(0.5, 0.08), 1.0)
+    assert not executor.needs_plan  # one reply is due
+    assert not executor.on_plan(plan(1)) and executor.needs_plan
+    np.testing.assert_allclose(executor.step().pose.p, poses(0.5, 0.08).p, atol=1e-6)
+    executor.on_request()
+    assert executor.on_plan(plan(2)) and executor.step() and executor.report.plans == 1
+
+
+def test_frozen_stamps_silence_and_frozen_images_hold(batches):
+    now = [100.0]
+    stack, client, robot = moved_on(batches, clock=lambda: now[0])
+    with stack:
+        robot.seen = robot.seen.replace(stamp=100.0, image_stamp=100.0)
+        client.step(robot.measure())
+        assert client.report.stale == 0 and not client.doubts
+        plans = client.report.plans
+        robot.seen, now[0] = robot.seen.replace(stamp=100.3), 100.3
+        for _ in range(60):  # no new plan after that which may be on its way
+            robot.send(client.step(robot.measure()))
+            time.sleep(0.01)
+        assert client.report.stale == 60 and client.report.plans <= plans + 1
+        assert [doubt.kind for doubt in client.doubts] == ["view"]
+        last = robot.commands[-1]
+        assert client.step(robot.measure()).pose.p.tolist() == last.pose.p.tolist()
+        robot.seen = robot.seen.replace(image_stamp=100.3)
+        now[0] = 100.6
+        assert client.step(robot.measure()) is None and client.report.silent == 1
+        robot.seen = robot.seen.replace(stamp=100.6, image_stamp=100.6)
+        assert client.step(robot.measure()) is None  # until a person says so
+        client.restart(robot.measure())
+        assert client.step(robot.measure()) is not None
+
+
+def test_a_trocar_that_moves_is_noticed_and_taken_at_a_restart(batches):
+    stack, client, robot = moved_on(batches)
+    with stack:
+        there = (WHERE + np.float32([0.0, 0.002, 0.0])).astype(np.float32)
+        robot.seen = robot.seen.replace(p_world_trocar=there)
+        assert client.step(robot.measure()) is None
+        assert client.report.fault.startswith("moved trocar")
+        with pytest.raises(UsageError):
+            client.restart(robot.measure())
+        client.restart(robot.measure(), there)
+        command = client.step(robot.measure())
+        assert float(rcm.rcm_error(command.pose, there)) < 1e-6
+
+
+def test_a_server_that_dies_before_the_first_request_is_noticed(batches):
+    robot = Robot()
+    with served.running(batches) as (where, _):
+        client = client_of(where)
+    deadline = time.monotonic() + 60.0
+    while not client.report.fault and time.monotonic() < deadline:
+        client.run(robot, 0.1)
+    assert client.report.lost == 1 and client.report.plans == 0
+    assert client.report.held == client.report.steps
+    client.close()
+
+
+@pytest.mark.parametrize("bounds", [{"max_following": 0.0}, {"max_age_s": np.nan}])
+def test_bounds_are_more_than_nothing(bounds):
+    with mistakes.of(f"tolerances.{next(iter(bounds))}"):
+        deploy.Client("nowhere", served.PORT, tolerances=deploy.Tolerances(**bounds))

@@ -8,6 +8,7 @@ import pickle
 import fakes
 import jax
 import jax.numpy as jnp
+import mistakes
 import numpy as np
 import pytest
 import strict
@@ -261,7 +262,7 @@ def test_numbers_that_no_robot_measures_are_refused(made):
     in_mm = good.replace(pose=good.pose._replace(p=1e3 * good.pose.p))
     refused("observation.pose.p: expected tips within 0.5 m", in_mm)
     other = jax.tree.map(lambda field: field[4], rcm.TROCARS)
-    refused("an axis that misses it by .* mm", trocar=other)
+    refused("max_off_trocar", trocar=other)
     with pytest.raises(ValueError, match=r"trocar.radius: expected at most 0.5 m, got 14"):
         jax.jit(lambda key: deployed(key, good, PORT._replace(radius=14.0)))(key)
     deployed(key, good, PORT)
@@ -340,7 +341,7 @@ def test_what_sensors_are_off_is_not_refused(made):
     deployed, key = shared(path), jax.random.key(0)
     good = observed(trained.policy, ())
     deployed(key, good.replace(gripper=1.05 * good.gripper), PORT)
-    pose = good.pose._replace(R=1.01 * good.pose.R, p=good.pose.p + 0.01 * good.pose.R[..., 0])
+    pose = good.pose._replace(R=1.01 * good.pose.R, p=good.pose.p + 0.002 * good.pose.R[..., 0])
     deployed(key, good.replace(pose=pose), PORT)
 
 
@@ -354,8 +355,28 @@ def test_a_tool_through_another_port_is_refused_where_the_policy_keeps_to_it(mad
     policy_file.save(file, trained._replace(method="dp_ee", params=params, normalizer=stats))
     given = jax.random.key(0), observed(trained.policy, ()), other
     load(file)(*given)
-    with pytest.raises(ValueError, match="an axis that misses it by"):
+    with mistakes.of("observation.pose", "mm"):
         load(file, method="dp_ee_proj")(*given)
+
+
+@MOSTLY_STATES
+def test_a_trocar_beside_the_shaft_is_refused_by_the_owners_bound(made):
+    file, trained, _ = made
+    seen, policy = observed(trained.policy, ()), shared(file)
+    strict_policy = load(file, max_off_trocar=1e-3)
+    where = np.asarray(rcm.trocar_position(PORT, policy.p_world_ref))
+
+    def beside(loaded, metres):
+        trocar = rcm.trocar_from_position(where + np.float32([metres, 0, 0]), loaded.p_world_ref)
+        return loaded(jax.random.key(0), seen, trocar)
+
+    beside(policy, 0.001)
+    for loaded, metres in ((policy, 0.004), (policy, 0.019), (strict_policy, 0.002)):
+        with mistakes.of("observation.pose", "mm"):
+            beside(loaded, metres)
+    beside(load(file, max_off_trocar=0.01), 0.004)
+    with mistakes.of("max_off_trocar"):
+        load(file, max_off_trocar=0.0)
 
 
 @pytest.mark.parametrize("rolls", [(1.4, 1.7), (1.7, 1.4)])
@@ -422,7 +443,7 @@ def test_one_number_of_one_robot_is_enough_to_refuse(made):
         "R: expected rot": {"pose": pose._replace(R=changed(pose.R, lambda x: x @ mirror))},
         "R: expected rotations": {"pose": pose._replace(R=changed(pose.R, lambda x: 1.1 * x))},
         "p: expected tips": {"pose": pose._replace(p=changed(pose.p, lambda x: x + 1.0))},
-        "an axis that misses": {
+        "max_off_trocar": {
             "pose": pose._replace(p=changed(pose.p, lambda x: x + np.eye(3)[0] * 0.05))
         },
     }

@@ -128,3 +128,22 @@ def test_a_log_has_a_line_a_reason():
     log.leave("")
     assert len(lines) < 10 and log.refused == 40
     assert all(line.startswith("client 1 ") and line.isprintable() for line in lines)
+
+
+@pytest.mark.parametrize("shape", [(480, 640), (640, 480), (128, 128)])
+def test_a_cameras_image_is_its_middle_square(shape):
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 255, (*shape, 3), np.uint8)
+    top, left = ((side - min(shape)) // 2 for side in shape)
+    middle = image[top : top + min(shape), left : left + min(shape)]
+    np.testing.assert_array_equal(images.square(image, min(shape)), middle)
+    np.testing.assert_array_equal(images.square(image, min(shape), bgr=True), middle[..., ::-1])
+    small = images.square(image, 64)
+    assert small.shape == (64, 64, 3) and small.dtype == np.uint8
+    assert abs(small.mean() - middle.mean()) < 2.0  # no black bars
+
+
+@pytest.mark.parametrize("image", [np.zeros((4, 4)), np.zeros((0, 4, 3)), np.full((4, 4, 3), 2.0)])
+def test_a_picture_that_is_none_is_one_line(image):
+    with mistakes.of("image"):
+        images.square(image, 8)

@@ -81,6 +81,38 @@ def test_values_that_are_none_are_left_out(rng, estimate, bad):
     assert (np.asarray(found.weight)[::3] == 0.0).all() and found.is_determined
 
 
+def few(rng, count, noise=3e-4):
+    """Many motions of a few poses in a cone of 25 degrees."""
+    half = np.deg2rad(12.5) * np.sqrt(rng.uniform(size=(200, count)))
+    around = 2 * np.pi * (np.arange(count) / count + rng.uniform(size=(200, 1)))
+    across = np.sin(half)[..., None] * np.stack([np.cos(around), np.sin(around)], -1)
+    axes = np.concatenate([across, -np.cos(half)[..., None]], -1)
+    tips = (TRUE + 0.1 * axes).astype(np.float32)
+    return moved(rng, tips, noise)
+
+
+@pytest.mark.parametrize("count", [3, 4, 5])
+def test_of_few_poses_it_is_the_least_squares_or_unknown(rng, estimate, count):
+    """Never a point far off that looks measured: the covariance tells how far."""
+    found = estimate(few(rng, count))
+    error = np.linalg.norm(np.asarray(found.p_world_trocar) - TRUE, axis=-1)
+    known = np.asarray(found.is_determined)
+    assert known.mean() > 0.9 and np.isnan(error[~known]).all()
+    assert np.nanmax(error) < 0.02 and np.nanmedian(error) < 1.5e-3
+
+
+def test_two_poses_are_none(rng, estimate):
+    assert np.isnan(estimate(few(rng, 2)).p_world_trocar).all()
+
+
+def test_ten_poses_over_twenty_degrees_are_enough(rng, estimate):
+    found = estimate(few(rng, 10))
+    deviation = np.sqrt(np.trace(found.covariance, axis1=-2, axis2=-1))
+    error = np.linalg.norm(np.asarray(found.p_world_trocar) - TRUE, axis=-1)
+    assert found.is_determined.all() and np.median(deviation) < 1e-3
+    assert np.mean(error < 3.0 * deviation) > 0.9
+
+
 def undetermined(rng):
     straight = np.tile(np.float32([0.01, 0.0, 0.02]), (300, 1))
     one = moved(rng, straight)
@@ -99,8 +131,8 @@ def undetermined(rng):
 def test_a_motion_that_says_nothing_is_refused(rng, estimate, name):
     pose = undetermined(rng)[name]
     found = estimate(pose)
-    assert not found.is_determined
-    assert all(np.isfinite(x).all() for x in found)
+    assert not found.is_determined and np.isnan(found.p_world_trocar).all()
+    assert all(np.isfinite(x).all() for x in found[1:])
     assert np.trace(found.covariance) > 1e6
 
 
@@ -114,7 +146,9 @@ def test_it_is_total(rng, estimate, oracle):
     shape = (2000, 12)
     pose = rcm.Pose(oracle.hostile(rng, (*shape, 3, 3)), oracle.hostile(rng, (*shape, 3)))
     found = estimate(pose)
-    assert all(np.isfinite(x).all() for x in found)
+    known = np.isfinite(found.p_world_trocar).all(-1)
+    assert (known == found.is_determined).all()
+    assert all(np.isfinite(x).all() for x in found[1:])
     assert (np.asarray(found.weight) >= 0.0).all() and (np.asarray(found.weight) <= 1.0).all()
 
 

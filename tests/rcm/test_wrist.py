@@ -344,3 +344,13 @@ def test_single_samples_and_batches_broadcast(rng, p_world_ref):
     assert got.is_feasible.shape == (4, 1)
     with pytest.raises(ValueError, match="angles"):
         rcm.tip_of(WRIST, shaft, np.zeros(3))
+
+
+def test_what_is_no_rotation_and_a_tip_above_the_trocar_are_not_feasible(rng, p_world_ref):
+    o = np.float32(p_world_ref)
+    good = rcm.Pose(np.float32(np.diag([1, -1, -1])), o - np.float32([0, 0, 0.1]))
+    assert rcm.through(WRIST, good, o).is_feasible
+    for R in (2.0 * good.R, good.R * [[-1.0, 1.0, 1.0]]):
+        assert not rcm.through(WRIST, good._replace(R=np.float32(R)), o).is_feasible
+    above = rcm.Pose(np.eye(3, dtype=np.float32), o + np.float32([0, 0, 0.05]))
+    assert not rcm.through(WRIST, above, o).is_feasible

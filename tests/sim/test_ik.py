@@ -8,6 +8,7 @@ import pytest
 
 from starjax import errors
 from starjax.sim import assets, ik
+from starjax.sim.chain import chain_of
 from starjax.types import Pose
 
 FR5_HOME = (-0.18, -1.10, 1.90, -2.36, -1.571, 0.0)
@@ -19,7 +20,7 @@ def fr5():
     arm = mujoco.MjSpec.from_file(str(assets.path("arms/fr5/fr5.xml")))
     tool = mujoco.MjSpec.from_file(str(assets.path("tools/grasper/grasper.xml")))
     arm.attach(tool, site=arm.site("flange"), prefix="tool/")
-    return ik.chain_of(arm.compile(), "shoulder", "tool/tcp")
+    return chain_of(arm.compile(), "shoulder", "tool/tcp")
 
 
 def numbers(values):
@@ -52,7 +53,7 @@ def random_arm(rng, bodies):
 def test_any_chain_of_hinges_and_slides_moves_as_in_mujoco(seed):
     rng = np.random.default_rng(seed)
     m, names = random_arm(rng, bodies=1 + seed % 7)
-    chain = ik.chain_of(m, "b0", "tip", names)
+    chain = chain_of(m, "b0", "tip", names)
     data = mujoco.MjData(m)
     data.qpos[:] = rng.normal(0, 1.0, m.nq)
     mujoco.mj_kinematics(m, data)
@@ -106,7 +107,7 @@ FREE = two_bodies('<freejoint name="x"/>', "")
 )
 def test_what_cannot_be_read_is_refused(xml, first, joints, argument, got):
     with pytest.raises(errors.UsageError) as raised:
-        ik.chain_of(mujoco.MjModel.from_xml_string(xml), first, "tip", joints)
+        chain_of(mujoco.MjModel.from_xml_string(xml), first, "tip", joints)
     assert (raised.value.argument, raised.value.got) == (argument, got)
 
 
@@ -132,7 +133,7 @@ def test_joints_stay_within_their_limits(fr5):
 @pytest.mark.parametrize("bodies", [3, 6])
 def test_a_near_pose_is_found_with_few_joints_and_with_many(bodies):
     rng = np.random.default_rng(bodies)
-    chain = ik.chain_of(random_arm(rng, bodies)[0], "b0", "tip")
+    chain = chain_of(random_arm(rng, bodies)[0], "b0", "tip")
     q, step = rng.normal(size=(2, len(chain.slides))).astype(np.float32)
     target, _, _ = ik.forward(chain, jnp.asarray(q + 0.05 * step))
     _, residual = ik.solve(chain, target, jnp.asarray(q), 20)
@@ -142,7 +143,7 @@ def test_a_near_pose_is_found_with_few_joints_and_with_many(bodies):
 def test_free_joints_return_to_where_they_are_at_home():
     """Five laps of a closed path: without the null-space term the redundant joints drift."""
     m = mujoco.MjModel.from_xml_string(SEVEN)
-    chain = ik.chain_of(m, "l0", "tip")
+    chain = chain_of(m, "l0", "tip")
     home = jnp.array([0.1, 0.6, -0.1, 1.2, 0.1, 0.8, 0.0])
     start, _, _ = ik.forward(chain, home)
     lap = np.linspace(0, 2 * np.pi, 60, endpoint=False)

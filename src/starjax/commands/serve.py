@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from starjax import errors
 from starjax.commands import checks, options
-from starjax.limits import Count, Range
+from starjax.limits import Count, Positive, Range
 from starjax.policies import packaged
 from starjax.runtime import jax_start, signals, xla
 
@@ -33,6 +33,8 @@ class ServeArgs:
     port: Annotated[int, Range(0, 65535)] = 8000  # listening port; 0: a free one
     batch: Annotated[int, Range(1, 256)] = 4  # maximum robots per inference
     clients: Count = 32  # maximum simultaneous connections
+    # maximum distance in m from a measured shaft to its trocar
+    max_off_trocar: Positive = 0.003
 
 
 def main(argv: Sequence[str]) -> int:
@@ -51,7 +53,7 @@ def main(argv: Sequence[str]) -> int:
     from starjax.deploy import server
 
     try:
-        policy = deploy.load(path)
+        policy = deploy.load(path, max_off_trocar=args.max_off_trocar)
     except errors.UsageError:
         raise
     except ValueError as error:

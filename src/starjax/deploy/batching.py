@@ -46,8 +46,8 @@ class Batches:
         valid, rows = [], []
         for i, request in enumerate(requests):
             try:
-                spec = self.policy.input_spec
-                rows.append(inputs.validate(spec, request.observation, request.trocar))
+                spec, off = self.policy.input_spec, self.policy.max_off_trocar
+                rows.append(inputs.validate(spec, request.observation, request.trocar, off))
                 valid.append(i)
             except UsageError as error:
                 replies[i] = error

@@ -7,36 +7,23 @@
 import collections
 import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import numpy as np
 
 from starjax import rcm
-from starjax.deploy import greeting, wire
+from starjax.deploy import greeting, guard, trocar_inputs, wire
 from starjax.deploy.connection import Connection
-from starjax.deploy.inputs import InputSpec, RobotObservation, check_trocar
+from starjax.deploy.inputs import RobotObservation
 from starjax.deploy.plan_executor import LIMITS, Limits, PlanExecutor, Report
+from starjax.deploy.robot import Robot
 from starjax.errors import UsageError
 from starjax.monitor.watch import Watch
-from starjax.sim.tasks.base import CONTROL_HZ
-from starjax.types import Command
+from starjax.types import Command, Pose
 
 TIMEOUT_S = 1.0  # of a reply, and of a connection attempt
 WAIT_S = 10.0  # for the first connection
-_MAX_HORIZON = 1024  # control steps of a plan
-
-
-class Robot(Protocol):
-    """A robot that `Client.run` can drive."""
-
-    def measure(self) -> RobotObservation:
-        """Measures pose `[*arms]`, gripper `[*arms]`, and image `[h, w, 3]`, images or state."""
-        ...
-
-    def send(self, command: Command) -> None:
-        """Takes a command `[*arms]`, to be reached by the next one."""
-        ...
 
 
 class Client:
@@ -50,13 +37,18 @@ class Client:
     If the policy has a runtime monitor, an alarm makes the client hold the last command and request
     no plans until `resume`; `report.alarm` has the score, its value and its threshold.
 
-    Every command is on the RCM manifold of the given trocar and within `limits` of the previous
-    one; no reply can break that.
+    Every command is on the RCM manifold of the given trocar, within `limits` of the previous one
+    and near the measured arm; no reply can break that. `guard.check` compares every measurement
+    with `tolerances`. A doubt about the arm (it does not follow, misses the trocar, or its
+    measurements are old) ends the commands until a person calls `restart`. A doubt about the images
+    lets the present plan end, then it holds.
 
     Attributes:
+      doubts: of the latest step.
       metadata: the server's greeting, see `server.metadata`.
       control_hz: commands per second.
       p_world_trocar: `[*arms, 3]` m.
+      input_spec: shapes of the policy's inputs.
     """
 
     def __init__(
@@ -68,6 +60,8 @@ class Client:
         api_key: str = "",
         ahead: int | None = None,
         limits: Limits = LIMITS,
+        tolerances: guard.Tolerances = guard.TOLERANCES,
+        clock: Callable[[], float] = time.time,
         timeout_s: float = TIMEOUT_S,
         wait_s: float = WAIT_S,
         is_watched: bool = True,
@@ -84,6 +78,8 @@ class Client:
           ahead: control steps between a request and the end of the present plan; None: the largest
             recent latency plus one.
           limits: of the commands' speeds.
+          tolerances: of the doubts about the arm and its images.
+          clock: s, that of `Observation.stamp`.
           timeout_s: of a reply; after it the client reconnects.
           wait_s: for the first connection.
           is_watched: hold on an alarm of the policy's runtime monitor.
@@ -93,20 +89,21 @@ class Client:
           UsageError: there is no server, it refuses the key, its policy does not keep to the RCM
             manifold, or the trocar is invalid or outside the workspace of the policy's task.
         """
+        for name, value in tolerances._asdict().items():
+            if not value > 0:
+                raise UsageError(f"tolerances.{name}", "more than 0", value)
         self._connection = connect(address, api_key, timeout_s, wait_s)
         try:
             self.metadata = self._connection.metadata
-            self._input_spec = spec = greeting.read_spec(self.metadata)
+            self.input_spec = spec = greeting.read_spec(self.metadata)
             if not spec.keeps_to_manifold:
                 expected = "a policy that keeps to the RCM manifold"
                 got = f"one of method {self.metadata.get('method')}"
                 raise UsageError("address", expected, got)
-            self.control_hz, horizon, execute = _read_timing(self.metadata)
-            self._trocar = _trocar(trocar, spec)
-            p_world_trocar = rcm.trocar_position(self._trocar, spec.p_world_ref)
-            self.p_world_trocar = np.asarray(p_world_trocar, np.float32)
+            self.control_hz, horizon, execute = greeting.read_timing(self.metadata)
             monitor = greeting.read_monitor(self.metadata, execute) if is_watched else None
             self._watch = Watch(monitor) if monitor else None
+            self._place(trocar)
             self._executor = PlanExecutor(
                 self.p_world_trocar, horizon, execute, ahead, limits, spec.held_wrist
             )
@@ -118,6 +115,9 @@ class Client:
         self._key, self._requests = key, 0
         self._next_key()  # compiles it
         self._moments: collections.deque[RobotObservation] = collections.deque(maxlen=spec.moments)
+        self._tolerances, self._clock, self.doubts = tolerances, clock, []
+        self._sent: collections.deque[Pose] = collections.deque(maxlen=guard.FOLLOWED)
+        self._is_silent = False
 
     @property
     def report(self) -> Report:
@@ -125,32 +125,69 @@ class Client:
         return self._executor.report
 
     @property
+    def plan(self) -> np.ndarray:
+        """Returns the tips `[K, *arms, 3]` m of the present plan that are still to come."""
+        return self._executor.rest
+
+    @property
     def reconnected(self) -> int:
         """Returns the number of reconnections."""
         return self._connection.connections - 1
 
-    def step(self, moment: RobotObservation) -> Command:
-        """Returns the next command `[*arms]`.
+    def step(self, moment: RobotObservation) -> Command | None:
+        """Returns the next command `[*arms]`, None while the arm is in doubt.
 
         Args:
           moment: present measurements, as of `Robot.measure`.
 
         Raises:
-          UsageError: the first moment's tool does not pass through the trocar.
+          UsageError: the arm is in doubt at the first moment.
         """
         executor = self._executor
-        if executor.last is None:
-            executor.begin(moment.pose, moment.gripper)
-            self._moments.extend([moment] * self._input_spec.moments)
+        if executor.last is None and not self._is_silent:
+            self._begin(moment)
         else:
-            self._moments.append(moment)
+            self.doubts = self._doubts(moment)
+            self._moments.append(_bare(moment))
+        is_stale = any(doubt.name in guard.STALE for doubt in self.doubts)
+        self.report.stale += is_stale
+        if arm := [doubt for doubt in self.doubts if doubt.kind == "arm"]:
+            self.stop(str(arm[0]))
         self._receive()
-        if executor.needs_plan and self._connection.is_up:
+        if self._is_silent:
+            self.report.silent += 1
+            return None
+        if executor.needs_plan and self._connection.is_up and not self.doubts:
             self._asked, self._moved = moment, self.report.steps - self.report.held
             self._connection.send(self._request())
             executor.on_request()
             self._receive()
-        return executor.step()
+        command = executor.step()
+        self._sent.append(command.pose)
+        return command
+
+    def stop(self, fault: str) -> None:
+        """Ends the commands until `restart`."""
+        self.report.fault, self._is_silent = fault, True
+        self._forget()
+
+    def restart(self, moment: RobotObservation, trocar: Any = None) -> None:
+        """Begins anew from the measured pose, once a person has looked at the arm.
+
+        Args:
+          moment: present measurements.
+          trocar: measured anew; None: as before.
+
+        Raises:
+          UsageError: the arm is in doubt, or the trocar invalid.
+        """
+        if trocar is not None:
+            self._place(trocar)
+            self._executor.p_world_trocar = self.p_world_trocar
+        self._forget()
+        self._begin(moment)
+        self._is_silent = False
+        self.resume()
 
     def resume(self) -> None:
         """Begins another episode for the monitor, and continues after its alarm."""
@@ -166,7 +203,8 @@ class Client:
         for _ in range(round(seconds * self.control_hz)):
             if should_stop():
                 break
-            robot.send(self.step(robot.measure()))
+            if (command := self.step(robot.measure())) is not None:
+                robot.send(command)
             due += period
             rest = due - time.monotonic()
             if rest < 0:
@@ -185,6 +223,37 @@ class Client:
     def __exit__(self, *error: object) -> None:
         self.close()
 
+    def _place(self, trocar: Any) -> None:
+        spec = self.input_spec
+        self._trocar = trocar_inputs.read(trocar, spec)
+        p_world_trocar = rcm.trocar_position(self._trocar, spec.p_world_ref)
+        self.p_world_trocar = np.asarray(p_world_trocar, np.float32)
+
+    def _begin(self, moment: RobotObservation) -> None:
+        """Takes the measured pose as the first to hold; raises UsageError if in doubt."""
+        self.doubts = self._doubts(moment)
+        if arm := [doubt for doubt in self.doubts if doubt.kind == "arm"]:
+            raise UsageError("observation", "an arm without doubt", str(arm[0]))
+        self._executor.begin(moment.pose, moment.gripper)
+        self._sent.append(self._executor.last.pose)
+        self._moments.extend([_bare(moment)] * self.input_spec.moments)
+
+    def _forget(self) -> None:
+        self._executor.forget()
+        self._sent.clear()
+
+    def _doubts(self, moment: RobotObservation) -> list[guard.Doubt]:
+        is_straight = self.input_spec.held_wrist is None
+        snapshot = guard.Snapshot(
+            moment.pose,
+            moment.pose if is_straight else moment.shaft,
+            moment.stamp,
+            moment.image_stamp,
+            moment.p_world_trocar,
+        )
+        now, where = self._clock(), self.p_world_trocar
+        return guard.check(snapshot, self._sent, where, now, self._tolerances)
+
     def _receive(self) -> None:
         reply = self._connection.poll()
         if reply is None:
@@ -192,7 +261,7 @@ class Client:
         if reply.value is None:
             return self._executor.on_failure(reply.fault, reply.is_lost)
         try:
-            plan = wire.decode_reply(self._input_spec, self._executor.horizon, reply.value)
+            plan = wire.decode_reply(self.input_spec, self._executor.horizon, reply.value)
         except UsageError as error:
             return self._executor.on_failure(str(error))
         if self._executor.on_plan(plan) and self._watch:
@@ -206,7 +275,7 @@ class Client:
         key = self._next_key()
         self._requests += 1
         observation = jax.tree.map(lambda *moments: np.stack(moments), *self._moments)
-        return wire.encode_request(self._input_spec, observation, self._trocar, key)
+        return wire.encode_request(self.input_spec, observation, self._trocar, key)
 
     def _next_key(self) -> np.ndarray | None:
         if self._key is None:
@@ -214,35 +283,6 @@ class Client:
         return np.asarray(jax.random.key_data(jax.random.fold_in(self._key, self._requests)))
 
 
-def _read_timing(metadata: dict[str, Any]) -> tuple[float, int, int]:
-    """Reads commands per second, commands per plan and how many of them are executed.
-
-    Raises:
-      UsageError: the rate differs from that of all policies, or a length is out of range.
-    """
-    hz, *lengths = (metadata.get(name) for name in ("control_hz", "horizon", "execute"))
-    if hz != CONTROL_HZ:
-        raise UsageError("address", f"a policy at {CONTROL_HZ:g} Hz", hz)
-    horizon, execute = (n if type(n) is int else 0 for n in lengths)
-    if not 1 <= execute <= horizon <= _MAX_HORIZON:
-        expected = f"1 <= execute <= horizon <= {_MAX_HORIZON}"
-        raise UsageError("address", expected, f"{lengths[1]} and {lengths[0]}")
-    return CONTROL_HZ, horizon, execute
-
-
-def _trocar(trocar: Any, spec: InputSpec) -> rcm.Trocar:
-    """Returns trocars of all arms, given as parameters or as positions `[*arms, 3]` m."""
-    arms = spec.arms
-    if not isinstance(trocar, rcm.Trocar):
-        place = np.asarray(trocar)
-        if place.dtype.kind not in "fiu" or place.shape != (*arms, 3):
-            expected = f"an rcm.Trocar or positions {[*arms, 3]} in m"
-            raise UsageError("trocar", expected, f"{type(trocar).__name__} {list(place.shape)}")
-        trocar = rcm.trocar_from_position(np.asarray(place, np.float32), spec.p_world_ref)
-    trocar = rcm.check_trocar(rcm.Trocar(*(np.asarray(x, np.float32) for x in trocar)))
-    shapes = [np.shape(x) for x in trocar]
-    if np.broadcast_shapes(*shapes) not in {(), arms}:
-        raise UsageError("trocar", f"fields of shape {list(arms)}", shapes)
-    trocar = rcm.Trocar(*(np.broadcast_to(x, arms) for x in trocar))
-    check_trocar(spec, trocar)
-    return trocar
+def _bare(moment: RobotObservation) -> RobotObservation:
+    """Returns the fields that a policy observes."""
+    return moment.replace(stamp=None, image_stamp=None, shaft=None, p_world_trocar=None)

@@ -23,7 +23,7 @@ _SILENT.propagate = False
 
 
 class Reply(NamedTuple):
-    """Outcome of a request.
+    """Outcome of a request, or the loss of the connection.
 
     Attributes:
       value: the frame's value, or None without an answer.
@@ -128,29 +128,31 @@ class Connection:
             raise UsageError("address", f"policy {before} as before reconnecting", digest)
         self.metadata, self.fault = metadata, ""
         self.connections += 1
+        while not self._requests.empty():  # sent as the last connection broke: too old
+            self._requests.get()
         self._up.set()
 
     def _exchange(self, socket: Any) -> None:
-        """Exchanges requests and replies until the connection breaks, which loses the request."""
-        while (frame := self._next_request(socket)) is not None:
-            try:
+        """Exchanges requests and replies until the connection breaks, which is a reply too."""
+        try:
+            while (frame := self._next_request(socket)) is not None:
                 socket.send(frame)
-                reply = socket.recv(self._timeout_s)
-            except (OSError, websockets.WebSocketException) as error:
-                # First down, then the reply: the caller must not send on a broken connection.
-                self._up.clear()
-                self._replies.put(Reply(None, str(error) or "no answer in time", is_lost=True))
-                raise
-            self._replies.put(_read(reply))
+                self._replies.put(_read(socket.recv(self._timeout_s)))
+        except (OSError, websockets.WebSocketException) as error:
+            # First down, then the reply: the caller must not send on a broken connection.
+            self._up.clear()
+            self._replies.put(Reply(None, str(error) or "no answer in time", is_lost=True))
+            raise
 
     def _next_request(self, socket: Any) -> bytes | None:
         """Waits for the next request, None at the end; raises if the connection breaks first."""
-        while True:
+        while not self._closing.is_set():
             try:
                 return self._requests.get(timeout=_POLL_S)
             except queue.Empty:
                 if socket.protocol.state is not websockets.State.OPEN:
                     raise ConnectionError("the server has closed the connection") from None
+        return None
 
 
 def _read(frame: Any) -> Reply:

@@ -84,10 +84,10 @@ class ConnectionPool:
                 self.address,
                 additional_headers=self._headers,
                 compression=None,
-                proxy=None,
                 max_size=MAX_REPLY,
                 open_timeout=CONNECT_S,
                 close_timeout=1.0,
+                proxy=None,
                 ping_interval=None,  # openpi's server answers no ping while its policy computes
                 logger=_SILENT,
             )

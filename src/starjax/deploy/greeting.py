@@ -11,10 +11,11 @@ from starjax.deploy import wire
 from starjax.deploy.inputs import InputSpec
 from starjax.errors import UsageError
 from starjax.monitor import calibrate
-from starjax.sim import names, scene
+from starjax.sim import names
 from starjax.sim.tasks.base import CONTROL_HZ
 
 MAX_CONNECTIONS = 64
+_MAX_HORIZON = 1024  # control steps of a plan
 _TASK_HINT = "give openpi's server metadata={'scene': {'task': 'peg_transfer'}}"
 
 
@@ -116,6 +117,22 @@ def read_monitor(metadata: dict[str, Any], execute: int) -> calibrate.Monitor | 
     return monitor
 
 
+def read_timing(metadata: dict[str, Any]) -> tuple[float, int, int]:
+    """Reads commands per second, commands per plan and how many of them are executed.
+
+    Raises:
+      UsageError: the rate differs from that of all policies, or a length is out of range.
+    """
+    hz, *lengths = (metadata.get(name) for name in ("control_hz", "horizon", "execute"))
+    if hz != CONTROL_HZ:
+        raise UsageError("address", f"a policy at {CONTROL_HZ:g} Hz", hz)
+    horizon, execute = (n if type(n) is int else 0 for n in lengths)
+    if not 1 <= execute <= horizon <= _MAX_HORIZON:
+        expected = f"1 <= execute <= horizon <= {_MAX_HORIZON}"
+        raise UsageError("address", expected, f"{lengths[1]} and {lengths[0]}")
+    return CONTROL_HZ, horizon, execute
+
+
 def _scene(value: Any) -> names.SceneNames:
     """Completes the names of a greeting's scene with the task's defaults."""
     if not isinstance(value, dict) or not isinstance(value.get("task"), str):
@@ -125,6 +142,8 @@ def _scene(value: Any) -> names.SceneNames:
         row = rows[field] = value.get(field) or []
         if not isinstance(row, list) or not all(isinstance(name, str) for name in row):
             raise UsageError(f"greeting.scene.{field}", "a list of names", repr(row)[:80])
+    from starjax.sim import scene  # of an evaluation; a robot has no simulator
+
     return scene.name(value["task"], rows["arms"], rows["tools"], rows["cameras"])
 
 

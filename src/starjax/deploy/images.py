@@ -37,6 +37,30 @@ def adapt(name: str, images: np.ndarray, size: int, moments: int) -> np.ndarray:
     return padded.reshape(*images.shape[:-3], size, size, 3)
 
 
+def square(image: np.ndarray, size: int, *, bgr: bool = False) -> np.ndarray:
+    """Returns the middle of a camera's image `[h, w, 3]` as `[size, size, 3]` uint8 RGB.
+
+    The longer side is cropped, so a policy that was trained on square pictures sees them at their
+    scale; a server pads instead (`adapt`).
+
+    Args:
+      image: uint8, or floats in [0, 1].
+      size: pixels per side, `policy.settings.image_size`.
+      bgr: True if the channels are blue, green, red, as OpenCV's.
+
+    Raises:
+      UsageError: no image, or numbers out of range.
+    """
+    image = np.asarray(image)
+    if image.ndim != 3 or image.shape[-1] != 3 or not image.size:
+        raise UsageError("image", "[h, w, 3]", list(image.shape))
+    height, width = image.shape[:2]
+    side = min(height, width)
+    top, left = (height - side) // 2, (width - side) // 2
+    image = image[top : top + side, left : left + side, :: -1 if bgr else 1]
+    return adapt("image", image, size, 1)
+
+
 def _as_uint8(name: str, images: np.ndarray) -> np.ndarray:
     kind = images.dtype.kind
     if images.dtype == np.uint8:

@@ -14,16 +14,16 @@ import numpy as np
 from jax import core
 
 from starjax import rcm, types
+from starjax.deploy import guard
+from starjax.deploy.guard import MAX_SKEW
 from starjax.errors import UsageError
 from starjax.sim import trocar_region
 from starjax.types import Pose
 
 FARTHEST = 0.5  # m, from the nominal trocar to a trocar or a tip: beyond, the unit is mm
-FARTHEST_OFF = 0.02  # m, from the measured axis to the trocar: beyond, the trocar or frame differs
 MAX_BEND = 0.2  # rad beyond the limits of a wrist: the error of a measured trocar is less
 _MAX_OPENING = 1.1  # of a gripper in [-1, 1]: the rest is the sensor's error
 _REAL = (jnp.floating, jnp.integer, jnp.bool_)
-MAX_SKEW = 0.05  # of R'R from the identity, far above rounding and calibration errors
 
 
 @flax.struct.dataclass
@@ -38,6 +38,10 @@ class RobotObservation:
       image: `[O, h, w, 3]` uint8, of a policy's one camera.
       images: camera's name -> `[O, h, w, 3]` uint8, instead of `image`.
       state: the task's fields, `[O, S]`, of a policy without cameras.
+      stamp, image_stamp: s, `[O]`, times of the oldest measurement and the oldest image, as
+        `time.time()`; `Client` and `drive` refuse old ones.
+      shaft: pose_world_shaft `[O]`, measured, of a tool with a wrist.
+      p_world_trocar: `[O, 3]` m, measured now, for `Client` and `drive` to notice its motion.
     """
 
     pose: Any
@@ -45,6 +49,10 @@ class RobotObservation:
     image: Any = None
     images: Any = None
     state: Any = None
+    stamp: Any = None
+    image_stamp: Any = None
+    shaft: Any = None
+    p_world_trocar: Any = None
 
 
 class InputSpec(NamedTuple):
@@ -79,9 +87,15 @@ class InputSpec(NamedTuple):
 
 
 def validate(
-    spec: InputSpec, observation: Any, trocar: Any
+    spec: InputSpec,
+    observation: Any,
+    trocar: Any,
+    max_off_trocar: float = guard.MAX_OFF_TROCAR,
 ) -> tuple[types.Observation, rcm.Trocar]:
     """Checks the inputs; returns them as arrays, with trocars `[*robots, *arms]`.
+
+    Args:
+      max_off_trocar: m, from a straight shaft or a measured one to its trocar.
 
     Raises:
       UsageError: see `Deployed.__call__`.
@@ -108,7 +122,7 @@ def validate(
     _check_shapes(spec, sensors, robots)
     trocar = rcm.Trocar(*(_broadcast(field, (*robots, *spec.arms)) for field in trocar))
     check_trocar(spec, trocar)
-    _check_values(spec, sensors, trocar, len(robots))
+    _check_values(spec, sensors, trocar, len(robots), observation.shaft, max_off_trocar)
     return sensors, trocar
 
 
@@ -177,9 +191,14 @@ def _check_shapes(spec: InputSpec, sensors: types.Observation, robots: tuple[int
 
 
 def _check_values(
-    spec: InputSpec, sensors: types.Observation, trocar: rcm.Trocar, leading: int
+    spec: InputSpec,
+    sensors: types.Observation,
+    trocar: rcm.Trocar,
+    leading: int,
+    shaft: Any,
+    max_off_trocar: float,
 ) -> None:
-    """Raises UsageError for values that no robot measures."""
+    """Raises UsageError for values that no robot measures, and tools off their trocar."""
     pose = sensors.pose
     rows = {"pose.R": pose.R, "pose.p": pose.p, "gripper": sensors.gripper, "state": sensors.state}
     values = {
@@ -212,16 +231,25 @@ def _check_values(
             expected = "tools through the trocar within the limits of the wrist"
             got = f"one that would bend it by {np.rad2deg(bend):.0f} degrees more"
             raise UsageError("observation.pose", expected, got)
+        if shaft is not None and not any(map(is_traced, shaft)):
+            place = np.expand_dims(trocar_position(trocar, spec.p_world_ref), leading)
+            check_off(float(guard.off_trocar(shaft, place).max()), max_off_trocar)
     elif spec.keeps_to_manifold:
         off, depth = map(float, _through(pose, trocar, spec.p_world_ref, leading))
-        if off > FARTHEST_OFF:
-            got = f"an axis that misses it by {1e3 * off:.0f} mm"
-            raise UsageError("observation.pose", "tools through the trocar", got)
+        check_off(off, max_off_trocar)
         if depth <= 0.0:
             expected = "tips beyond the trocar along the tool's axis, which points out of the jaws"
             hint = "a quaternion w x y z read as x y z w turns a tool round"
             got = f"one {-1e3 * depth:.0f} mm before it"
             raise UsageError("observation.pose", expected, got, hint)
+
+
+def check_off(off: float, max_off_trocar: float) -> None:
+    """Raises UsageError for a shaft `off` m from its trocar."""
+    if not off <= max_off_trocar:
+        expected = f"a shaft within max_off_trocar, {1e3 * max_off_trocar:.3g} mm, of the trocar"
+        hint = "measure the trocar and the frames again"
+        raise UsageError("observation.pose", expected, f"{1e3 * off:.3g} mm", hint)
 
 
 @functools.partial(jax.jit, static_argnums=3)

@@ -62,9 +62,12 @@ class Report:
       missed: plans that arrived after the previous plan ended.
       stretched: commands beyond `execute` of a plan, while the next one was late.
       held: repetitions of the last command, for want of a plan; also before the first plan.
+      silent: steps without a command, because the arm was in doubt.
+      stale: steps with a pose or an image that was too old.
       limited: commands clipped to `Limits`.
-      refused: replies without a valid plan; `fault` is the reason of the last one.
-      lost: requests without a reply: the connection broke or timed out.
+      refused: replies without a valid plan.
+      fault: reason of the last silence, loss or refusal.
+      lost: connections that broke, or replies that timed out.
       overran: control periods of `Client.run` that took too long.
       alarms: of the policy's runtime monitor; `alarm` describes the last one.
       latencies: of every plan, from the request to its arrival.
@@ -75,6 +78,8 @@ class Report:
     missed: int = 0
     stretched: int = 0
     held: int = 0
+    silent: int = 0
+    stale: int = 0
     limited: int = 0
     refused: int = 0
     lost: int = 0
@@ -91,6 +96,7 @@ class PlanExecutor:
     Attributes:
       report: counts so far.
       last: the last command, None before the first.
+      p_world_trocar: `[*arms, 3]` m; another one only before `begin`.
     """
 
     def __init__(
@@ -120,20 +126,21 @@ class PlanExecutor:
                 raise UsageError(f"limits.{name}", "more than 0", value)
         self.report, self.last = Report(), None
         self.horizon, self.execute, self._ahead, self._limits = horizon, execute, ahead, limits
-        self._p_world_trocar = np.asarray(p_world_trocar, np.float32)
+        self.p_world_trocar = np.asarray(p_world_trocar, np.float32)
         self._plan: Command | None = None
         self._next: Command | None = None  # arrived, waits for the end of the present plan
         # Indices in the present plan: its next command, and the planned end.
         self._index = self._until = 0
         self._is_pending = self._is_late = self._is_stopped = False
+        self._is_void = False  # the pending reply is of before `forget`
         self._moved = self._waited = 0  # control steps since the request, without and with holds
         self._latencies: collections.deque[int] = collections.deque(maxlen=_REMEMBERED)
-        still = rcm.pose_on_manifold(_DOWN, 0.0, _DEPTH, self._p_world_trocar)
+        still = rcm.pose_on_manifold(_DOWN, 0.0, _DEPTH, self.p_world_trocar)
         self._motion = plan_motion.of(wrist)
-        still = jax.device_get(self._motion.hold(jax.device_get(still), self._p_world_trocar))
+        still = jax.device_get(self._motion.hold(jax.device_get(still), self.p_world_trocar))
         self._toward(still, still)
         plan: list[Any] = [np.broadcast_to(x, (horizon, *x.shape)) for x in still]
-        self._motion.worst(Pose(*plan), self._p_world_trocar)
+        self._motion.worst(Pose(*plan), self.p_world_trocar)
         self._command(still, np.zeros(0))
 
     @property
@@ -142,6 +149,13 @@ class PlanExecutor:
         if self._ahead is not None:
             return self._ahead
         return min(self._max_ahead, max(self._latencies, default=self._max_ahead) + _SPARE)
+
+    @property
+    def rest(self) -> np.ndarray:
+        """Returns the tips `[K, *arms, 3]` m of the present plan that are still to come."""
+        if self._plan is None:
+            return np.zeros((0, *self.p_world_trocar.shape), np.float32)
+        return self._plan.pose.p[self._index :]
 
     @property
     def needs_plan(self) -> bool:
@@ -155,7 +169,7 @@ class PlanExecutor:
 
     def on_failure(self, fault: str, is_lost: bool = False) -> None:
         """Records that the request brought no plan."""
-        self._is_pending = False
+        self._is_pending = self._is_void = False
         self.report.fault = fault
         self.report.lost += is_lost
         self.report.refused += not is_lost
@@ -171,9 +185,18 @@ class PlanExecutor:
         """Allows requests again after an alarm."""
         self._is_stopped = False
 
+    def forget(self) -> None:
+        """Drops all plans and the last command: the arm may be elsewhere, `begin` comes next."""
+        self._plan = self._next = self.last = None
+        self._index = self._until = 0
+        self._is_late, self._is_void = False, self._is_pending
+
     def on_plan(self, plan: Command) -> bool:
-        """Stores the requested plan `[H, *arms]`; returns False for one off the RCM manifold."""
-        off, depth, skew = map(float, self._motion.worst(plan.pose, self._p_world_trocar))
+        """Stores the requested plan `[H, *arms]`; returns False for one that is not executed."""
+        if self._is_void:
+            self._is_pending = self._is_void = False
+            return False
+        off, depth, skew = map(float, self._motion.worst(plan.pose, self.p_world_trocar))
         if not (off <= MAX_OFF and depth > 0.0 and skew <= MAX_SKEW):
             got = f"{1e3 * off:.3g} mm from the trocar, {1e3 * depth:.3g} mm beyond it"
             self.on_failure(f"plan: expected one on the RCM manifold, got axes {got}")
@@ -194,7 +217,7 @@ class PlanExecutor:
             if not np.isfinite(values).all():
                 raise UsageError(f"observation.{name}", "finite values", values.tolist())
         pose, opening = Pose(*sensors[:2]), np.clip(sensors[2], -1.0, 1.0)
-        held = jax.device_get(self._motion.hold(pose, self._p_world_trocar))
+        held = jax.device_get(self._motion.hold(pose, self.p_world_trocar))
         _, move, turn = self._toward(pose, held)
         if self._exceeds(move, turn):
             got = f"one that must turn by {turn:.2g} rad"
@@ -234,11 +257,11 @@ class PlanExecutor:
 
     def _toward(self, last: Pose, target: Pose) -> tuple[Pose, np.ndarray, np.ndarray]:
         limits = self._limits.per_step
-        return jax.device_get(self._motion.toward(last, target, self._p_world_trocar, *limits))
+        return jax.device_get(self._motion.toward(last, target, self.p_world_trocar, *limits))
 
     def _command(self, pose: Pose, gripper: Any) -> Command:
         return Command(
-            pose, gripper, jax.device_get(self._motion.angles(pose, self._p_world_trocar))
+            pose, gripper, jax.device_get(self._motion.angles(pose, self.p_world_trocar))
         )
 
     def _exceeds(self, move: np.ndarray, turn: np.ndarray) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 
 from starjax import config, errors, methods, rcm, types
 from starjax.data import normalizer
-from starjax.deploy import approach, inputs, random_keys
+from starjax.deploy import approach, guard, inputs, random_keys
 from starjax.deploy.inputs import RobotObservation
 from starjax.monitor.calibrate import Monitor
 from starjax.policies import packaged, policy_file, sampling
@@ -26,6 +26,8 @@ from starjax.runtime import files, precompile
 from starjax.sim import registries, trocar_region, wrists
 from starjax.sim.names import SceneNames
 from starjax.types import Command, Pose
+
+_BOUNDS = ("max_first_move", "max_first_turn", "max_off_trocar")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -41,6 +43,7 @@ class Deployed:
       p_world_ref: `[3]` m, the nominal trocar, origin of trocar parameters; `[A, 3]` of A arms.
       max_first_move: m, maximum distance from the measured tip to a plan's first tip.
       max_first_turn: rad, the same of the rotation.
+      max_off_trocar: m, maximum distance from the measured shaft to the trocar.
       input_spec: shapes of the inputs.
       monitor: runtime monitor of the file, None without one or if other options or another method
         change the plans; `monitor.watch.Watch` runs it.
@@ -54,6 +57,7 @@ class Deployed:
     p_world_ref: np.ndarray
     max_first_move: float
     max_first_turn: float
+    max_off_trocar: float
     input_spec: inputs.InputSpec = dataclasses.field(repr=False)
     _source: tuple[Any, ...] = dataclasses.field(repr=False)
     _infer: Callable[..., tuple[Command, approach.StartOffset]] = dataclasses.field(repr=False)
@@ -96,13 +100,13 @@ class Deployed:
           UsageError: an input is missing, has the wrong shape or type, is not finite or cannot have
             been measured: `R` is not a rotation, the tip is farther than `FARTHEST` from the
             nominal trocar, or the trocar farther than `trocar_region.OUTSIDE` from the task's
-            workspace. For a policy on the RCM manifold also if the tool's axis passes the trocar by
-            more than `FARTHEST_OFF`, or the tip is not beyond it. Also if the plan begins farther
-            than `max_first_move` or `max_first_turn` from the tool. Inside `jit` only shapes and
-            types are checked.
+            workspace. For a policy on the RCM manifold also if the shaft passes the trocar by more
+            than `max_off_trocar`, or the tip is not beyond it. Also if the plan begins farther than
+            `max_first_move` or `max_first_turn` from the tool. Inside `jit` only shapes and types
+            are checked.
         """
         random_keys.check(key)
-        sensors, trocar = inputs.validate(self.input_spec, observation, trocar)
+        sensors, trocar = inputs.validate(self.input_spec, observation, trocar, self.max_off_trocar)
         robots = np.shape(trocar.radius)[: np.ndim(trocar.radius) - len(self.input_spec.arms)]
         keys = jax.random.split(key, robots[0]) if robots else key[None]
         if not robots:
@@ -128,7 +132,7 @@ class Deployed:
 
     def __reduce__(self) -> tuple[Callable[..., "Deployed"], tuple[Any, ...]]:
         path, digest, settings = self._source
-        bounds = {"max_first_move": self.max_first_move, "max_first_turn": self.max_first_turn}
+        bounds = {name: getattr(self, name) for name in _BOUNDS}
         return _load_again, (path, digest, {**settings, **bounds})
 
     def check_first(self, offset: approach.StartOffset) -> None:
@@ -154,6 +158,7 @@ def load(
     *,
     max_first_move: float = approach.MAX_FIRST_MOVE,
     max_first_turn: float = approach.MAX_FIRST_TURN,
+    max_off_trocar: float = guard.MAX_OFF_TROCAR,
     **options: Any,
 ) -> Deployed:
     """Loads a policy from its file.
@@ -168,6 +173,8 @@ def load(
       max_first_move: m, maximum distance from the measured tip to a plan's first tip; for the owner
         of a robot to choose. Infinity disables the check.
       max_first_turn: rad, the same of the rotation.
+      max_off_trocar: m, maximum distance from the measured shaft to the trocar: the first command
+        moves the shaft as far in the wall.
       options: of the policy's learner at inference; default: those of the training. For diffusion
         `ddim_steps`, the number of denoising steps, and `temperature`.
 
@@ -176,7 +183,7 @@ def load(
         bound is out of range; `method` has other weights; or the task, a tool or the learner is not
         installed.
     """
-    for name, bound in (("max_first_move", max_first_move), ("max_first_turn", max_first_turn)):
+    for name, bound in zip(_BOUNDS, (max_first_move, max_first_turn, max_off_trocar), strict=True):
         if not (isinstance(bound, numbers.Real) and bound > 0):
             raise errors.UsageError(name, "a number above 0", repr(bound))
     path = packaged.find("policy", str(policy))
@@ -219,6 +226,7 @@ def load(
         p_world_ref=input_spec.p_world_ref,
         max_first_move=float(max_first_move),
         max_first_turn=float(max_first_turn),
+        max_off_trocar=float(max_off_trocar),
         input_spec=input_spec,
         _source=(str(path.absolute()), files.sha256(path), {"method": method, **options}),
         _infer=precompile.Program(infer),

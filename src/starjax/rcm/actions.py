@@ -141,7 +141,7 @@ def make_space(name: str, encode: Callable, decode: Callable, **sizes: int) -> A
         slices[part] = slice(dim, dim + size)
         dim += size
 
-    @arrays.broadcasting
+    @arrays.compiled()
     def encode_pose(
         pose: types.Pose, trocar: Where, p_world_ref: ArrayLike | None = None
     ) -> jax.Array:
@@ -156,7 +156,7 @@ def make_space(name: str, encode: Callable, decode: Callable, **sizes: int) -> A
             [jnp.broadcast_to(part, (*batch, part.shape[-1])) for part in parts], axis=-1
         )
 
-    @arrays.broadcasting
+    @arrays.compiled()
     def decode_action(
         action: ArrayLike, trocar: Where, p_world_ref: ArrayLike | None = None
     ) -> tuple[types.Pose, jax.Array]:

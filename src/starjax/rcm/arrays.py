@@ -1,13 +1,18 @@
 """Inputs of RCM maps: one float type, checked shapes, safe directions."""
 
 import functools
+import inspect
 from collections.abc import Callable, Iterable
 from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import core
 from jax.typing import ArrayLike
 
+MAX_PROGRAMS = 64  # of a map, one per combination of shapes and types
+_VALUES = (jax.Array, np.ndarray, np.number, np.bool_, int, float)
 _BOUND = 1e30  # bound of finite inputs: their sums and squares do not overflow
 
 Arguments = ParamSpec("Arguments")
@@ -31,6 +36,48 @@ def broadcasting(function: Callable[Arguments, Result]) -> Callable[Arguments, R
             return function(*args, **kwargs)
 
     return mapped
+
+
+def compiled(*static: str) -> Callable[[Callable[Arguments, Result]], Callable[Arguments, Result]]:
+    """Lets a map broadcast, and run as one program where its arrays are concrete.
+
+    Operation by operation, as a loop of a robot or a notebook calls them, a map of forty operations
+    takes 5 ms; its program 0.1 ms. A program is kept for each combination of shapes and types, at
+    most `MAX_PROGRAMS` a map. With tracers, and within a program, the map is traced as it is.
+
+    Args:
+      static: names of arguments that are part of the program, such as the sizes of a wrist.
+    """
+
+    def decorate(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+        program = jax.jit(function, static_argnames=static)
+        names = tuple(inspect.signature(function).parameters)
+
+        @functools.wraps(function)
+        def mapped(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+            given = dict(zip(names, args)) | kwargs
+            fixed = [given.pop(name, None) for name in static]
+            if not _are_concrete(given) or not _are_numbers(fixed):
+                return function(*args, **kwargs)
+            if program._cache_size() >= MAX_PROGRAMS:
+                program.clear_cache()
+            return program(*args, **kwargs)
+
+        return broadcasting(mapped)
+
+    return decorate
+
+
+def _are_concrete(values: Any) -> bool:
+    """Returns True for numbers and arrays outside of any program."""
+    leaves = jax.tree.leaves(values)
+    if any(isinstance(x, core.Tracer) or not isinstance(x, _VALUES) for x in leaves):
+        return False
+    return not isinstance(jnp.zeros(()), core.Tracer)  # a constant is one within a program
+
+
+def _are_numbers(values: Any) -> bool:
+    return all(isinstance(x, int | float | np.number) for x in jax.tree.leaves(values))
 
 
 def checked(**named: tuple[Any, tuple[int, ...]]) -> list[jax.Array]:

@@ -19,6 +19,7 @@ _FARTHEST = 1e3  # m; tips beyond are ignored, as non-finite ones
 _FINEST = 1e-5  # m; a line nearer to the point is no outlier
 _DAMPING = 1e-5  # well below the least eigenvalue at `MIN_SPREAD`
 _COARSE, _FINE = 40, 10  # steps of the two minimisations
+_FEW = 10.0  # lines; fewer may leave no scale to tell outliers by
 _CUT = 4.685  # deviations beyond which the weight is zero (Tukey's, for 95% efficiency)
 _RAYLEIGH = 1.1774  # median distance from a point, of lines with unit deviation each way
 
@@ -27,9 +28,10 @@ class TrocarEstimate(NamedTuple):
     """An estimated trocar.
 
     Attributes:
-      p_world_trocar: `[..., 3]` m; the median of the tips if undetermined.
+      p_world_trocar: `[..., 3]` m; NaN if undetermined, which every later check refuses.
       residual: `[...]` m, weighted root mean square of the lines' distances from the point (Eq. 3).
-        The point itself may be off by as much: a wrist that bends by 2 degrees leaves 3 to 4 mm.
+        It says how straight the shaft is, not how well few or parallel lines fix the point: that is
+        `covariance`. A wrist that bends by 2 degrees leaves 3 to 4 mm, by which the point is off.
       covariance: `[..., 3, 3]` m^2 of the point, for independent errors of the lines; very large if
         undetermined. Those of a bending wrist are not independent.
       weight: `[..., T]` in [0, 1] of the lines: 0 for an outlier.
@@ -47,7 +49,7 @@ class TrocarEstimate(NamedTuple):
     is_straight: jax.Array
 
 
-@arrays.broadcasting
+@arrays.compiled("wrist")
 def trocar_from_poses(
     pose: types.Pose,
     wrist: wrists.Wrist | None = None,
@@ -56,8 +58,10 @@ def trocar_from_poses(
     """Estimates the trocar from a moving tool: the point nearest to the lines of its shaft.
 
     The minimum of the sum of distances, a convex function that tolerates a third of wrong poses, is
-    the start; weighted squares (Tukey's, by the median distance) refine it. Turning about the shaft
-    and sliding along it leave the point along it undetermined: see `is_determined`.
+    the start; weighted squares (Tukey's, by the median distance) refine it. Among fewer than ten
+    lines the weights may keep too few; plain least squares then replace them. Turning about the
+    shaft and sliding along it leave the point along it undetermined: see `is_determined`. Ten poses
+    whose axes span 20 degrees determine it well.
 
     Args:
       pose: pose_world_tip `[..., T]` of a straight tool, or pose_world_shaft; with `wrist`
@@ -96,23 +100,24 @@ def trocar_from_poses(
 
     point = jax.lax.fori_loop(0, _COARSE, nearer, jnp.zeros_like(centre))
     point = jax.lax.fori_loop(0, _FINE, better, point)
-    distance = _distance(point, axis, p)
-    weight = _weight(distance, known)
-    count = jnp.sum(weight, -1)
-    normal = _normal(axis, weight)
-    # The least eigenvalue is the mean square of sin(angle to the axes' common direction).
-    spread = jnp.linalg.eigvalsh(jax.lax.stop_gradient(normal))[..., 0]
+    weight = _weight(_distance(point, axis, p), known)
+    is_plain = ~_is_spread(axis, weight) & (jnp.sum(known, -1) < _FEW)
+    plain = jax.lax.fori_loop(0, 3, lambda _, x: _step(x, axis, p, known), jnp.zeros_like(centre))
+    point = jnp.where(is_plain[..., None], plain, point)
+    weight = jnp.where(is_plain[..., None], known, weight)
+    distance, count = _distance(point, axis, p), jnp.sum(weight, -1)
     total = jnp.sum(weight * distance**2, -1)
     residual = jnp.sqrt(jnp.maximum(total / jnp.maximum(count, 1.0), 1e-30))
     is_straight = residual <= MAX_RESIDUAL
-    is_spread = (spread >= np.sin(MIN_SPREAD) ** 2) & (count >= MIN_LINES)
-    is_determined = is_spread & is_straight
+    is_determined = _is_spread(axis, weight) & is_straight
     variance = total / jnp.maximum(2.0 * count - 3.0, 1.0)  # a line fixes two coordinates
     eye = jnp.eye(3, dtype=p.dtype)
-    safe = jnp.where(is_determined[..., None, None], normal, eye)
+    safe = jnp.where(is_determined[..., None, None], _normal(axis, weight), eye)
+    # A constant NaN would trip `jax_debug_nans` for every estimate.
+    unknown = jax.lax.stop_gradient(jnp.zeros_like(count) / is_determined.astype(count.dtype))
     covariance = (variance / jnp.maximum(count, 1.0))[..., None, None] * _inverse(safe)
     return TrocarEstimate(
-        p_world_trocar=centre + jnp.where(is_determined[..., None], point, 0.0),
+        p_world_trocar=jnp.where(is_determined[..., None], centre + point, unknown[..., None]),
         residual=residual,
         covariance=jnp.where(is_determined[..., None, None], covariance, _FARTHEST**2 * eye),
         weight=weight,
@@ -135,6 +140,14 @@ def why_undetermined(estimate: TrocarEstimate) -> str:
         f"the axes miss any one point by {1e3 * residual[i]:.0f} mm: another frame or axis, or an "
         "instrument with a wrist, which needs its angles or the poses of its shaft"
     )
+
+
+def _is_spread(axis: jax.Array, weight: jax.Array) -> jax.Array:
+    """Returns True `[...]` if enough lines of different directions have weight."""
+    # The least eigenvalue is the mean square of sin(angle to the axes' common direction).
+    normal = jax.lax.stop_gradient(_normal(axis, weight))
+    spread = jnp.linalg.eigvalsh(normal)[..., 0]
+    return (spread >= np.sin(MIN_SPREAD) ** 2) & (jnp.sum(weight, -1) >= MIN_LINES)
 
 
 def _step(point: jax.Array, axis: jax.Array, p: jax.Array, weight: jax.Array) -> jax.Array:

@@ -15,7 +15,7 @@ HOLD_DEPTH = 0.05  # m; of the hold pose
 _STRAIGHT_DOWN = np.array([0.0, 0.0, -1.0], np.float32)
 
 
-@arrays.broadcasting
+@arrays.compiled()
 def rcm_error(pose: types.Pose, p_world_trocar: ArrayLike) -> jax.Array:
     """Returns the distance of the trocar from the line of the shaft (Eq. 3).
 
@@ -30,14 +30,14 @@ def rcm_error(pose: types.Pose, p_world_trocar: ArrayLike) -> jax.Array:
     return arrays.norm(jnp.cross(p - p_world_trocar, R[..., :, 2]))
 
 
-@arrays.broadcasting
+@arrays.compiled()
 def insertion_depth(pose: types.Pose, p_world_trocar: ArrayLike) -> jax.Array:
     """Returns the signed depth d `[...]` m of the tip beyond the trocar along the axis (Eq. 3)."""
     R, p, p_world_trocar = _checked(pose, p_world_trocar)
     return arrays.dot(p - p_world_trocar, R[..., :, 2])[..., 0]
 
 
-@arrays.broadcasting
+@arrays.compiled()
 def pose_on_manifold(
     axis_world: ArrayLike, roll: ArrayLike, depth: ArrayLike, p_world_trocar: ArrayLike
 ) -> types.Pose:
@@ -56,7 +56,7 @@ def pose_on_manifold(
     return pose_at_depth(R, depth, p_world_trocar)
 
 
-@arrays.broadcasting
+@arrays.compiled()
 def pose_at_depth(
     R_world_tip: ArrayLike, depth: ArrayLike, p_world_trocar: ArrayLike
 ) -> types.Pose:
@@ -92,7 +92,7 @@ def axis_and_depth(
     return arrays.direction(p - p_world_trocar, _STRAIGHT_DOWN)
 
 
-@arrays.broadcasting
+@arrays.compiled()
 def project(pose: types.Pose, p_world_trocar: ArrayLike) -> types.Pose:
     """Projects a pose onto the manifold (post hoc, for DP-EE-Proj).
 

@@ -20,7 +20,7 @@ _E_Y = np.array([0.0, 1.0, 0.0], np.float32)
 _E_Z = np.array([0.0, 0.0, 1.0], np.float32)
 
 
-@arrays.broadcasting
+@arrays.compiled()
 def rotation_align(a: ArrayLike, b: ArrayLike) -> jax.Array:
     """Returns the smallest rotation that turns the direction of `a` into that of `b` (Eq. 16).
 
@@ -61,7 +61,7 @@ def _align_unit(a: jax.Array, b: jax.Array) -> jax.Array:
     return eye + turn - _outer((1.0 - cos) * a, a) - _outer(factor * spanning, spanning)
 
 
-@arrays.broadcasting
+@arrays.compiled()
 def rotation_z(angle: ArrayLike) -> jax.Array:
     """Returns the rotation `[..., 3, 3]` by `angle` `[...]` rad about the z axis."""
     (angle,) = arrays.checked(angle=(angle, ()))
@@ -77,7 +77,7 @@ def cos_sin(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
     return jnp.cos(angle), jnp.sin(angle)
 
 
-@arrays.broadcasting
+@arrays.compiled()
 def rotation_from_axis_roll(axis_world: ArrayLike, roll: ArrayLike) -> jax.Array:
     """Returns the tool rotation with a given axis and roll (Alg. 1, lines 3-6).
 
@@ -102,7 +102,7 @@ def rotation_from_axis_roll(axis_world: ArrayLike, roll: ArrayLike) -> jax.Array
     return jnp.stack([x, y, z], axis=-1)
 
 
-@arrays.broadcasting
+@arrays.compiled()
 def roll_of(R_world_tip: ArrayLike) -> jax.Array:
     """Returns the roll `[...]` in [-pi, pi] rad of R, inverse to `rotation_from_axis_roll`.
 
@@ -125,14 +125,14 @@ def roll_of(R_world_tip: ArrayLike) -> jax.Array:
     return jnp.where(jnp.isnan(axis).any(-1), arrays.taint(axis)[..., 0], roll)
 
 
-@arrays.broadcasting
+@arrays.compiled()
 def rot6d_encode(R: ArrayLike) -> jax.Array:
     """Returns the first two columns of `R` `[..., 3, 3]`, concatenated: `[..., 6]`."""
     (R,) = arrays.checked(R=(R, (3, 3)))
     return jnp.concatenate([R[..., :, 0], R[..., :, 1]], axis=-1)
 
 
-@arrays.broadcasting
+@arrays.compiled()
 def rot6d_decode(rot6d: ArrayLike) -> jax.Array:
     """Builds a rotation from two columns by Gram-Schmidt, for any input.
 

@@ -81,7 +81,7 @@ TROCARS: Trocar = _degrees(
 IS_SEEN: np.ndarray = _constant(np.arange(12) < 8)
 
 
-@arrays.broadcasting
+@arrays.compiled()
 def trocar_position(trocar: Trocar, p_world_ref: ArrayLike) -> jax.Array:
     """Returns the position of the trocar in the world frame (Eq. 2).
 
@@ -108,7 +108,7 @@ def trocar_position(trocar: Trocar, p_world_ref: ArrayLike) -> jax.Array:
     return p_world_ref + offset
 
 
-@arrays.broadcasting
+@arrays.compiled()
 def trocar_from_position(p_world_trocar: ArrayLike, p_world_ref: ArrayLike) -> Trocar:
     """Returns the parameters of a trocar measured in the world frame: Eq. 2 solved for lambda.
 
@@ -137,7 +137,7 @@ def trocar_from_position(p_world_trocar: ArrayLike, p_world_ref: ArrayLike) -> T
     return Trocar(radius, polar, jnp.where(azimuth < 0.0, azimuth + 2.0 * np.pi, azimuth))
 
 
-@arrays.broadcasting
+@arrays.compiled()
 def trocar_rotation(trocar: Trocar) -> jax.Array:
     """Returns R_world_trocar `[..., 3, 3]` of {T}: z down, x horizontal along the azimuth."""
     fields = arrays.checked(**named_fields(trocar))
@@ -148,7 +148,7 @@ def trocar_rotation(trocar: Trocar) -> jax.Array:
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-@arrays.broadcasting
+@arrays.compiled()
 def trocar_frame(trocar: Trocar, p_world_ref: ArrayLike, roll_zero: ArrayLike = 0.0) -> TrocarFrame:
     """Resolves a trocar (Eq. 2 and frame {T}).
 

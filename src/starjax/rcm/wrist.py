@@ -26,6 +26,7 @@ from starjax.rcm import arrays, manifold, rotations, wrist_checks
 from starjax.types import Pose
 
 _E_Z = np.array([0.0, 0.0, 1.0], np.float32)
+MAX_SKEW = 1e-3  # of a requested matrix from a rotation
 _FARTHEST = 1e9  # m; bound of offsets from the trocar, whose squares stay finite
 
 
@@ -61,7 +62,7 @@ class WristPose(NamedTuple):
     Attributes:
       pose: pose_world_tip `[...]`.
       wrist: `[..., 2]` rad, pitch and yaw.
-      is_feasible: `[...]`, True if the pose is the requested one.
+      is_feasible: `[...]`, True if the pose is the requested one and its tip below the trocar.
     """
 
     pose: Pose
@@ -69,7 +70,7 @@ class WristPose(NamedTuple):
     is_feasible: jax.Array
 
 
-@arrays.broadcasting
+@arrays.compiled("wrist")
 def tip_of(wrist: Wrist, pose_world_shaft: Pose, angles: ArrayLike) -> Pose:
     """Returns pose_world_tip `[...]` of a shaft and wrist angles.
 
@@ -84,7 +85,7 @@ def tip_of(wrist: Wrist, pose_world_shaft: Pose, angles: ArrayLike) -> Pose:
     return Pose(arrays.matmul(R, bend.R), p + arrays.matvec(R, bend.p))
 
 
-@arrays.broadcasting
+@arrays.compiled("wrist")
 def shaft_of(wrist: Wrist, pose_world_tip: Pose, angles: ArrayLike) -> Pose:
     """Returns pose_world_shaft `[...]` of a tip and wrist angles; needs no trocar.
 
@@ -100,7 +101,7 @@ def shaft_of(wrist: Wrist, pose_world_tip: Pose, angles: ArrayLike) -> Pose:
     return Pose(R, p - arrays.matvec(R, bend.p))
 
 
-@arrays.broadcasting
+@arrays.compiled("wrist")
 def angles_through(wrist: Wrist, pose_world_tip: Pose, p_world_trocar: ArrayLike) -> jax.Array:
     """Returns the wrist angles that put the shaft through the trocar.
 
@@ -119,7 +120,7 @@ def angles_through(wrist: Wrist, pose_world_tip: Pose, p_world_trocar: ArrayLike
     return jnp.where(jnp.isfinite(unknown), angles, unknown)
 
 
-@arrays.broadcasting
+@arrays.compiled("wrist")
 def through(wrist: Wrist, pose_world_tip: Pose, p_world_trocar: ArrayLike) -> WristPose:
     """Finds a feasible pose near a tip pose, with the shaft through the trocar and the tip kept.
 
@@ -134,12 +135,14 @@ def through(wrist: Wrist, pose_world_tip: Pose, p_world_trocar: ArrayLike) -> Wr
       p_world_trocar: `[..., 3]` m.
 
     Returns:
-      WristPose `[...]`; NaN and not feasible if an input is not finite.
+      WristPose `[...]`; NaN and not feasible if an input is not finite. Matrices other than
+      rotations, for example scaled ones, are not feasible.
     """
     wrist_checks.check_wrist(wrist)
     R, p, o = _checked(pose_world_tip, p_world_trocar=(p_world_trocar, (3,)))
     unknown = _taint(R, p, o)
-    R, o, offset = _rotation(R), arrays.bounded(o), _offset(p, o)
+    requested, R, o, offset = R, _rotation(R), arrays.bounded(o), _offset(p, o)
+    is_rotation = jnp.max(jnp.abs(requested - R), (-2, -1)) <= MAX_SKEW
     line, length = arrays.direction(offset, -_E_Z)
     is_feasible, angles = _is_feasible(wrist, _angles(wrist, R, offset), length)
     # An infeasible tip near the trocar has its yaw axis before the trocar and angles half a turn
@@ -163,7 +166,7 @@ def through(wrist: Wrist, pose_world_tip: Pose, p_world_trocar: ArrayLike) -> Wr
     return WristPose(
         Pose(jnp.where(is_known[..., None], tip.R, unknown[..., None]), tip.p + unknown),
         jnp.where(is_known, angles, unknown),
-        is_feasible & is_known[..., 0],
+        is_feasible & is_known[..., 0] & is_rotation & (offset[..., 2] < 0.0),
     )
 
 

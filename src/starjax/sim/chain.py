@@ -1,34 +1,10 @@
 """Reads a serial arm off a compiled model: a chain of hinges and slides."""
 
-import flax.struct
 import mujoco
 import numpy as np
 
 from starjax import errors
-
-
-@flax.struct.dataclass
-class Chain:
-    """A chain of J hinges about, and slides along, local z axes; numpy constants.
-
-    `chain.replace(p_base=...)` makes it stand elsewhere, also where that is traced.
-
-    Attributes:
-      p_base, R_base: `[3]` m, `[3, 3]`: the frame that the first body stands in.
-      offsets: `[J, 3]` m and `rotations`: `[J, 3, 3]`: each joint's frame in the one before it.
-      p_tip, R_tip: the tip in the last joint's frame.
-      limits: `[J, 2]` rad (m of a slide), infinite for an unlimited joint.
-      slides: True for each of the J joints that is a slide.
-    """
-
-    p_base: np.ndarray
-    R_base: np.ndarray
-    offsets: np.ndarray
-    rotations: np.ndarray
-    p_tip: np.ndarray
-    R_tip: np.ndarray
-    limits: np.ndarray
-    slides: tuple[bool, ...] = flax.struct.field(pytree_node=False)
+from starjax.sim.ik import Chain
 
 
 def chain_of(m: mujoco.MjModel, first: str, site: str, joints: tuple[str, ...] = ()) -> Chain:

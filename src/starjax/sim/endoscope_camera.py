@@ -4,16 +4,18 @@ It is a camera without a body: it has no contacts and casts no shadow.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from starjax.rcm import trocar as trocars
 from starjax.sim.names import TISSUE
 from starjax.types import Pose
+
+if TYPE_CHECKING:  # a robot loads tasks without the simulator
+    import mujoco
 
 NAME = "endoscope"  # of the camera
 STREAM = 0x73636F70  # folded into an episode's key: objects and tips are drawn as without it
@@ -79,8 +81,10 @@ def nominal(endoscope: Endoscope) -> Pose:
         return looking_at(work, p_trocar, np.mean(endoscope.distance), endoscope.up)
 
 
-def add(world: mujoco.MjSpec, endoscope: Endoscope) -> None:
+def add(world: "mujoco.MjSpec", endoscope: Endoscope) -> None:
     """Adds the camera at its nominal pose to a model's world."""
+    import mujoco
+
     pose, wxyz = nominal(endoscope), np.zeros(4)
     mujoco.mju_mat2Quat(wxyz, np.asarray(pose.R, float).ravel())
     p = np.asarray(pose.p, float)

@@ -1,12 +1,11 @@
 """Forward and inverse kinematics of a serial arm (Eq. 17), single-sample."""
 
+import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from starjax.sim import linear
-from starjax.sim.chain import Chain as Chain
-from starjax.sim.chain import chain_of as chain_of
 from starjax.types import Pose
 
 # Weight of rotation errors against position errors, m/rad.
@@ -18,6 +17,30 @@ MAX_STEP = 0.35
 # Joint targets stay this far inside the limits (rad, m).
 LIMIT_MARGIN = 0.01
 POSE_SIZE = 6  # degrees of freedom of a pose: joints beyond six are redundant
+
+
+@flax.struct.dataclass
+class Chain:
+    """A chain of J hinges about, and slides along, local z axes; numpy constants.
+
+    `chain.replace(p_base=...)` makes it stand elsewhere, also where that is traced.
+
+    Attributes:
+      p_base, R_base: `[3]` m, `[3, 3]`: the frame that the first body stands in.
+      offsets: `[J, 3]` m and `rotations`: `[J, 3, 3]`: each joint's frame in the one before it.
+      p_tip, R_tip: the tip in the last joint's frame.
+      limits: `[J, 2]` rad (m of a slide), infinite for an unlimited joint.
+      slides: True for each of the J joints that is a slide.
+    """
+
+    p_base: np.ndarray
+    R_base: np.ndarray
+    offsets: np.ndarray
+    rotations: np.ndarray
+    p_tip: np.ndarray
+    R_tip: np.ndarray
+    limits: np.ndarray
+    slides: tuple[bool, ...] = flax.struct.field(pytree_node=False)
 
 
 def forward(chain: Chain, q: jax.Array) -> tuple[Pose, jax.Array, jax.Array]:

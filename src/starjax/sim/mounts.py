@@ -13,6 +13,7 @@ import numpy as np
 from starjax import rcm
 from starjax.sim import ik, mjcf_parts, robot
 from starjax.sim.arms.base import Arm, Mount
+from starjax.sim.chain import chain_of
 from starjax.sim.tools.base import Tool
 from starjax.sim.workspaces import Workspace
 from starjax.types import Pose
@@ -86,13 +87,13 @@ def bench(arm: Arm, tool: Tool) -> Bench:
 
     Raises:
       errors.UsageError: its part lacks something, see `robot.read`, or its joints cannot be read,
-        see `ik.chain_of`.
+        see `chain_of`.
     """
     whole, held = robot.read(arm), mjcf_parts.read(f"tool {tool.name}", tool.mjcf)
     whole.attach(held, site=whole.site(robot.FLANGE), prefix="tool/")
     m = whole.compile()
     flange, tip = (
-        ik.chain_of(m, arm.first, site, arm.joints) for site in (robot.FLANGE, f"tool/{tool.base}")
+        chain_of(m, arm.first, site, arm.joints) for site in (robot.FLANGE, f"tool/{tool.base}")
     )
     settings = ArmSettings(arm.rest_gain, arm.remote_centre, arm.watched, arm.link_radius)
     return Bench(flange, tip, tool.wrist, settings)

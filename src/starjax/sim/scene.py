@@ -27,6 +27,7 @@ from starjax.sim import (
 )
 from starjax.sim.arms.base import Arm, Mount
 from starjax.sim.camera import geometry
+from starjax.sim.chain import chain_of
 from starjax.sim.names import TISSUE, SceneNames
 from starjax.sim.quiet_mjx import mjx
 from starjax.sim.tasks.base import Task
@@ -252,7 +253,7 @@ def _mounted(task: Task, names: SceneNames) -> list[tuple[Arm, Tool, Mount]]:
 def _bind(m: mujoco.MjModel, i: int, arm: Arm, tool: Tool, mount: Mount) -> BoundArm:
     at = f"arm{i}/"
     names = tuple(at + joint for joint in arm.joints)
-    chain = ik.chain_of(m, first=at + arm.first, site=at + f"tool/{tool.base}", joints=names)
+    chain = chain_of(m, first=at + arm.first, site=at + f"tool/{tool.base}", joints=names)
     wrist = tuple(f"{at}tool/{joint}" for joint in tool.wrist_joints)
     joints = [m.joint(name) for name in names + wrist]
     held = [m.joint(j) for j in range(m.njnt) if m.joint(j).name.startswith(f"{at}tool/")]

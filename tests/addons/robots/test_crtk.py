@@ -148,3 +148,90 @@ def test_a_wrong_number_of_joints_is_named():
     short = types.SimpleNamespace(name=list(psm.JOINTS), position=[0.0] * 4)
     with mistakes.of("measured_js.position", "0.0"):
         crtk.joints_of(short, psm.JOINTS)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_an_older_message_is_read_and_written(seed):
+    """TransformStamped, which `_cp` topics had until 2023."""
+    pose, frames = drawn(seed), crtk.Frames(drawn(100 + seed), drawn(200 + seed), "base")
+    parts = message().pose
+    older = types.SimpleNamespace(
+        header=types.SimpleNamespace(frame_id=""),
+        transform=types.SimpleNamespace(translation=parts.position, rotation=parts.orientation),
+    )
+    sent = crtk.fill_pose(older, pose, frames)
+    assert sent.header.frame_id == "base"
+    np.testing.assert_allclose(crtk.pose_of(sent, frames).p, pose.p, atol=1e-12)
+
+
+def test_a_header_has_the_name_of_its_frame():
+    pose, stamped = drawn(0), message()
+    stamped.header = types.SimpleNamespace(
+        frame_id="", stamp=types.SimpleNamespace(sec=7, nanosec=5 * 10**8)
+    )
+    with mistakes.of("frames.frame_id"):  # empty: a dVRK's endoscope
+        crtk.fill_pose(stamped, pose, AT)
+    named = AT._replace(frame_id="PSM1_base")
+    assert crtk.fill_pose(stamped, pose, named).header.frame_id == "PSM1_base"
+    np.testing.assert_allclose(crtk.pose_of(stamped, named).p, pose.p, atol=1e-12)
+    for other in ("ECM", ""):
+        stamped.header.frame_id = other
+        with mistakes.of("measured_cp.header.frame_id"):
+            crtk.pose_of(stamped, named)
+    assert crtk.stamp_of(stamped) == 7.5
+
+
+def test_the_base_in_the_endoscope_is_between_two_measurements():
+    view_base, tip = drawn(1), drawn(2)
+    local = crtk.fill_pose(message(), tip, AT)
+    viewed = crtk.fill_pose(message(), crtk.compose(view_base, tip), AT)
+    found = crtk.pose_view_base(viewed, local)
+    np.testing.assert_allclose(found.p, view_base.p, atol=1e-12)
+    np.testing.assert_allclose(found.R, view_base.R, atol=1e-12)
+
+
+@pytest.mark.parametrize("names", psm.NAMES)
+def test_joints_have_the_names_of_the_robot(names):
+    measured = types.SimpleNamespace(name=list(names), position=[0.1 * i for i in range(6)])
+    assert crtk.names_of(measured, psm.NAMES) == names
+    measured.name[0] = "elbow"
+    with mistakes.of("measured_js.name"):
+        crtk.names_of(measured, psm.NAMES)
+
+
+DOWN = np.diag([1.0, -1.0, -1.0])
+
+
+@pytest.mark.parametrize(
+    ("R", "p", "argument"),
+    [
+        (DOWN, [0.0, 0.0, -100.0], "pose_base_tip.p"),  # mm
+        (DOWN, [0.0, 0.0, np.nan], "pose_base_tip.p"),
+        (2.0 * DOWN, [0.0, 0.0, -0.1], "pose_base_tip.R"),
+        (-DOWN, [0.0, 0.0, -0.1], "pose_base_tip.R"),  # mirrored
+        (DOWN * np.nan, [0.0, 0.0, -0.1], "pose_base_tip.R"),
+        (DOWN[:2], [0.0, 0.0, -0.1], "pose_base_tip"),
+    ],
+)
+def test_a_tip_that_is_none_has_no_joints(R, p, argument):
+    with mistakes.of(argument):
+        psm.joints_of(Pose(np.array(R), np.array(p)), psm.LARGE_NEEDLE_DRIVER)
+
+
+@pytest.mark.parametrize(
+    "q", [[30.0, 5.0, 0.1, 20.0, 0.0, 0.0], [0.1, 0.1, 120.0, 0.0, 0.0, 0.0], [np.nan] * 6]
+)
+def test_joints_in_degrees_or_mm_are_none(q):
+    for use in (psm.tip_of, psm.shaft_of):
+        with mistakes.of("q"):
+            use(np.array(q), psm.PROGRASP)
+
+
+def test_joints_come_back_in_double_precision():
+    rng = np.random.default_rng(0)
+    low, high = [-1.5, -0.9, 0.03, -3.0, -1.3, -1.3], [1.5, 0.9, 0.24, 3.0, 1.3, 1.3]
+    for q in rng.uniform(low, high, (500, 6)):
+        found = psm.joints_of(psm.tip_of(q, psm.LARGE_NEEDLE_DRIVER), psm.LARGE_NEEDLE_DRIVER)
+        np.testing.assert_allclose(found, q, atol=1e-9)
+        tip = psm.tip_of(q, psm.LARGE_NEEDLE_DRIVER)
+        assert np.abs(psm._angles(*tip, psm.LARGE_NEEDLE_DRIVER.wrist) - q[4:]).max() < 1e-9

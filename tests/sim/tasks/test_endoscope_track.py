@@ -11,6 +11,7 @@ import pytest
 
 from starjax import rcm
 from starjax.sim import ik, registries, scene
+from starjax.sim.chain import chain_of
 from starjax.sim.tasks.base import Contacts, SimReadings
 from starjax.sim.tasks.endoscope_track import expert, task
 from starjax.types import Pose
@@ -50,7 +51,7 @@ def test_the_camera_is_judged_where_mujoco_has_it(tool):
     data.qpos[:6] = [0.1, -1.2, 1.4, -1.0, -1.5, 0.3]
     mujoco.mj_kinematics(m, data)
     mujoco.mj_camlight(m, data)
-    chain = ik.chain_of(m, "arm0/shoulder", "arm0/tool/tcp")
+    chain = chain_of(m, "arm0/shoulder", "arm0/tool/tcp")
     order = [m.joint(f"arm0/j{i + 1}").qposadr[0] for i in range(6)]
     pose, _, _ = ik.forward(chain, jnp.asarray(data.qpos[order], jnp.float32))
     camera, at = measured(m, pose).camera, m.camera(task.CAMERA).id

@@ -11,7 +11,9 @@ ROS path is untested. CRTK uses SI units and quaternions x y z w.
     measured_js       measured joints              `joints_of`   -> as `addons.robots.psm` has them
     servo_jp          target joints                `fill_joints` <- as `addons.robots.psm` has them
 
-`setpoint_cp`, the robot's last target tip, has the form of `measured_cp`.
+`setpoint_cp`, the robot's last target tip, has the form of `measured_cp`. On a dVRK with an
+endoscope `measured_cp`, `setpoint_cp` and `servo_cp` are relative to it, and only
+`local/measured_cp` to the arm's remote centre: `pose_view_base` is between the two.
 """
 
 from collections.abc import Sequence
@@ -34,10 +36,13 @@ class Frames(NamedTuple):
       pose_world_base: base frame of the robot's poses, in the policy's world.
       pose_tool_tip: the policy's tip in the frame that the robot reports: z along the shaft, out
         of the jaws, y in the direction of their opening.
+      frame_id: name of the base frame in headers, e.g. `PSM1_base`. Empty it means the endoscope on
+        a dVRK, so `fill_pose` refuses that.
     """
 
     pose_world_base: Pose
     pose_tool_tip: Pose
+    frame_id: str = ""
 
 
 class Jaw(NamedTuple):
@@ -53,15 +58,19 @@ class Jaw(NamedTuple):
 
 
 def pose_of(message: Any, frames: Frames) -> Pose:
-    """Returns pose_world_tip of `measured_cp`, a PoseStamped or Pose.
+    """Returns pose_world_tip of `measured_cp`, a PoseStamped, TransformStamped, Pose or Transform.
 
     Raises:
-      UsageError: a value is not finite, or the quaternion is not of unit length.
+      UsageError: a value is not finite, the quaternion is not of unit length, or the header names
+        another frame than `frames`.
     """
-    pose = getattr(message, "pose", message)
-    position, wxyz = pose.position, pose.orientation
+    header = getattr(message, "header", None)
+    if header is not None and frames.frame_id and header.frame_id != frames.frame_id:
+        expected, got = f"frame {frames.frame_id}", header.frame_id or "none: that of an endoscope"
+        raise UsageError("measured_cp.header.frame_id", expected, got, "local/measured_cp has it")
+    position, quaternion = _parts(message)
     p = _finite("measured_cp.position", [position.x, position.y, position.z])
-    xyzw = np.array([wxyz.x, wxyz.y, wxyz.z, wxyz.w], np.float64)
+    xyzw = np.array([quaternion.x, quaternion.y, quaternion.z, quaternion.w], np.float64)
     if not abs(np.linalg.norm(xyzw) - 1.0) < _MAX_NORM_ERROR:
         raise UsageError("measured_cp.orientation", "a unit quaternion", xyzw.tolist())
     pose_base_tool = _pose(Rotation.from_quat(xyzw).as_matrix(), p)
@@ -69,23 +78,40 @@ def pose_of(message: Any, frames: Frames) -> Pose:
 
 
 def fill_pose(message: Any, pose_world_tip: Pose, frames: Frames) -> Any:
-    """Fills `servo_cp`, a PoseStamped or Pose, and returns it; its header is the caller's.
+    """Fills `servo_cp`, a message as in `pose_of`, with the name of its frame, and returns it.
 
     Raises:
-      UsageError: a value is not finite, or R is no rotation; the message is unchanged.
+      UsageError: a value is not finite, R is no rotation, or a header would stay without a frame;
+        the message is unchanged.
     """
     R = np.asarray(pose_world_tip.R, np.float64)
     if not np.abs(R.T @ R - np.eye(3)).max() < _MAX_NORM_ERROR or np.linalg.det(R) < 0.0:
         raise UsageError("servo_cp.orientation", "a rotation", R.tolist())
     _finite("servo_cp.position", pose_world_tip.p)
+    header = getattr(message, "header", None)
+    if header is not None:
+        if not (frames.frame_id or header.frame_id):
+            hint = "a dVRK reads none as the endoscope's"
+            raise UsageError("frames.frame_id", "the name of the base frame", "none", hint)
+        header.frame_id = frames.frame_id or header.frame_id
     pose_world_tool = compose(pose_world_tip, inverse(frames.pose_tool_tip))
     pose = compose(inverse(frames.pose_world_base), pose_world_tool)
+    position, quaternion = _parts(message)
     x, y, z, w = Rotation.from_matrix(np.asarray(pose.R, np.float64)).as_quat(canonical=True)
-    part = getattr(message, "pose", message)
-    part.orientation.x, part.orientation.y = float(x), float(y)
-    part.orientation.z, part.orientation.w = float(z), float(w)
-    part.position.x, part.position.y, part.position.z = map(float, pose.p)
+    quaternion.x, quaternion.y, quaternion.z, quaternion.w = map(float, (x, y, z, w))
+    position.x, position.y, position.z = map(float, pose.p)
     return message
+
+
+def pose_view_base(measured_cp: Any, local_measured_cp: Any) -> Pose:
+    """Returns the pose of a dVRK arm's base in its endoscope, of two messages of one moment."""
+    tool = Frames(*[Pose(np.eye(3), np.zeros(3))] * 2)
+    return compose(pose_of(measured_cp, tool), inverse(pose_of(local_measured_cp, tool)))
+
+
+def stamp_of(message: Any) -> float:
+    """Returns the header's time in s, for `Observation.stamp`."""
+    return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
 
 
 def opening_of(message: Any, jaw: Jaw) -> float:
@@ -150,6 +176,19 @@ def fill_joints(message: Any, q: Any, names: Sequence[str]) -> Any:
     return message
 
 
+def names_of(message: Any, sets: Sequence[Sequence[str]]) -> Sequence[str]:
+    """Returns the set of names that `measured_js` has, for `joints_of` and `fill_joints`.
+
+    Raises:
+      UsageError: it lacks a name of each.
+    """
+    for names in sets:
+        if set(names) <= set(message.name):
+            return names
+    expected = " or ".join(", ".join(names) for names in sets)
+    raise UsageError("measured_js.name", expected, ", ".join(message.name) or "none")
+
+
 def is_ready(message: Any) -> bool:
     """Returns True if `operating_state` permits motion: enabled, homed and not busy."""
     return message.state == "ENABLED" and bool(message.is_homed) and not message.is_busy
@@ -178,6 +217,14 @@ def _finite(argument: str, values: Any) -> np.ndarray:
     if not np.isfinite(values).all():
         raise UsageError(argument, "finite values", values.tolist())
     return values
+
+
+def _parts(message: Any) -> tuple[Any, Any]:
+    """Returns position and quaternion of a Pose or a Transform, stamped or not."""
+    part = getattr(message, "pose", None) or getattr(message, "transform", None) or message
+    if hasattr(part, "translation"):
+        return part.translation, part.rotation
+    return part.position, part.orientation
 
 
 def _pose(R: Any, p: Any) -> Pose:

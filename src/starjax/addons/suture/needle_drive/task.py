@@ -6,12 +6,11 @@ the jaws turn it about the arc's centre: this needs a tool with a wrist.
 """
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from starjax import rcm
@@ -30,6 +29,9 @@ from starjax.sim.tasks.base import (
     TaskStatus,
 )
 from starjax.types import Pose
+
+if TYPE_CHECKING:  # a robot loads tasks without the simulator
+    import mujoco
 
 # Draws. Directions in which one grasp serves every trocar with the roll within 1.6 rad of its zero.
 SPREAD = 0.006  # of the bite's middle, either way
@@ -103,7 +105,7 @@ class DriveBound(NamedTuple):
     jaws: np.ndarray
 
 
-def bind(size: Needle, m: mujoco.MjModel) -> DriveBound:
+def bind(size: Needle, m: "mujoco.MjModel") -> DriveBound:
     """Resolves the ids of the needle and the jaws."""
     joint, body = m.joint("needle"), m.body("needle")
     dof = int(joint.dofadr[0])

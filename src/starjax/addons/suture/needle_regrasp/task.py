@@ -5,12 +5,11 @@ driving it is held a third from its swage, square to the jaws: that fixes the ti
 only a tool with a wrist can have at every trocar.
 """
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from starjax import rcm
@@ -19,6 +18,9 @@ from starjax.sim import bodies, endoscope_camera, workspaces
 from starjax.sim.tasks.base import SimReadings, Slot, Task, TaskStatus
 from starjax.sim.tasks.needle_pick import task as pick
 from starjax.types import Pose
+
+if TYPE_CHECKING:  # a robot loads tasks without the simulator
+    import mujoco
 
 MAX_TILT = float(np.deg2rad(30.0))
 SPREAD = (0.015, 0.010)  # of the needle's centre on the plate, either way
@@ -75,7 +77,7 @@ class RegraspBound(NamedTuple):
     pivot: np.ndarray
 
 
-def bind(m: mujoco.MjModel) -> RegraspBound:
+def bind(m: "mujoco.MjModel") -> RegraspBound:
     """Resolves the ids of the needle, the pads and the plate."""
     names = ("bed_x", "bed_y")
     return RegraspBound(

@@ -4,12 +4,11 @@ The scope looks down through its trocar, so gravity cannot define the horizon: w
 the trocar the image would have to spin. Up in the image is a horizontal direction, `UP`.
 """
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from starjax import errors
@@ -17,6 +16,9 @@ from starjax.sim import endoscope_camera
 from starjax.sim.tasks.base import CONTROL_HZ, Capsules, Field, SimReadings, Slot, Task, TaskStatus
 from starjax.sim.tasks.endoscope_track import text
 from starjax.types import Pose
+
+if TYPE_CHECKING:  # a robot loads tasks without the simulator
+    import mujoco
 
 CAMERA = "endoscope"
 UP = (-1.0, 0.0, 0.0)
@@ -108,13 +110,13 @@ class TrackBound(NamedTuple):
     radius: float
 
 
-def bind(m: mujoco.MjModel) -> TrackBound:
+def bind(m: "mujoco.MjModel") -> TrackBound:
     """Resolves the ids of the target, and the camera's pose on the tool.
 
     Raises:
       errors.UsageError: the tool has no camera.
     """
-    if mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_CAMERA, CAMERA) < 0:
+    if CAMERA not in [m.camera(i).name for i in range(m.ncam)]:
         raise errors.UsageError("tool", f"one with a camera {CAMERA}", "one without")
     camera, names = m.camera(CAMERA), [f"target_{axis}" for axis in "xyz"]
     tip = m.site(int(np.flatnonzero(m.site_bodyid == camera.bodyid[0])[0]))
@@ -241,6 +243,8 @@ def is_sound(bound: TrackBound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
 
 
 def _matrix(wxyz: np.ndarray) -> np.ndarray:
+    import mujoco
+
     R = np.zeros(9)
     mujoco.mju_quat2Mat(R, wxyz)
     return R.reshape(3, 3)

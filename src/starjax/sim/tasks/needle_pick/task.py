@@ -3,12 +3,11 @@
 Needle frame: origin at its centre of mass, the arc in the x-y plane, z up as it lies.
 """
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from starjax import rcm
@@ -16,6 +15,9 @@ from starjax.sim import bodies, endoscope_camera, workspaces
 from starjax.sim.tasks.base import Field, SimReadings, Slot, Task, TaskStatus
 from starjax.sim.tasks.needle_pick import text
 from starjax.types import Pose
+
+if TYPE_CHECKING:  # a robot loads tasks without the simulator
+    import mujoco
 
 # The needle, as in needle_pick.xml (a test holds these to the compiled model).
 SEGMENTS = 7  # of the wire; the last one ends in the point
@@ -98,7 +100,7 @@ def segments() -> tuple[np.ndarray, np.ndarray]:
     return centres.astype(np.float32), tangents.astype(np.float32)
 
 
-def bind(m: mujoco.MjModel) -> NeedleBound:
+def bind(m: "mujoco.MjModel") -> NeedleBound:
     """Resolves the ids of the needle and the pads."""
     pads = [g for g in range(m.ngeom) if "/pad_" in m.geom(g).name]
     return NeedleBound(

@@ -4,12 +4,11 @@ Lengths in m. Block frame: origin at the rim's centre, z up when it stands; wall
 is at 120 i degrees from x.
 """
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from starjax import rcm
@@ -17,6 +16,9 @@ from starjax.sim import bodies, endoscope_camera, workspaces
 from starjax.sim.tasks.base import Capsules, Field, SimReadings, Slot, Task, TaskStatus
 from starjax.sim.tasks.peg_transfer import text
 from starjax.types import Pose
+
+if TYPE_CHECKING:  # a robot loads tasks without the simulator
+    import mujoco
 
 # The block, as in world.xml (a test holds these to the compiled model).
 RIM_RADIUS = 0.007  # from the axis to a wall's centre line
@@ -104,7 +106,7 @@ class PegBound(NamedTuple):
     pegs: np.ndarray
 
 
-def bind(m: mujoco.MjModel) -> PegBound:
+def bind(m: "mujoco.MjModel") -> PegBound:
     """Resolves the ids of block, pegs and seats."""
     count = sum(m.geom(g).name.startswith("peg") for g in range(m.ngeom))
     peg_geoms = np.array([m.geom(f"peg{i}").id for i in range(count)])

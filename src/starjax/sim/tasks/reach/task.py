@@ -1,16 +1,18 @@
 """Reach: the tip goes to the marked point and rests there. Lengths in m."""
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from starjax.sim import endoscope_camera, workspaces
 from starjax.sim.tasks.base import Capsules, Field, SimReadings, Slot, Task, TaskStatus
 from starjax.sim.tasks.reach import text
+
+if TYPE_CHECKING:  # a robot loads tasks without the simulator
+    import mujoco
 
 # Where an episode begins.
 TIP_HOME = (0.0, 0.0, 0.06)
@@ -64,7 +66,7 @@ class ReachBound(NamedTuple):
     posts: np.ndarray
 
 
-def bind(m: mujoco.MjModel) -> ReachBound:
+def bind(m: "mujoco.MjModel") -> ReachBound:
     """Resolves the ids of marks and posts."""
     count = sum(m.geom(g).name.startswith("mark") for g in range(m.ngeom))
     geoms = np.array([m.geom(f"mark{i}").id for i in range(count)])

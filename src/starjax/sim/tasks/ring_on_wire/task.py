@@ -4,12 +4,11 @@ Lengths in m. Ring frame: origin at its centre, y along its normal, z towards it
 in the plane x = 0; it is the same from either end, and an episode begins at one of them.
 """
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import flax.struct
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
 from starjax import rcm
@@ -19,6 +18,9 @@ from starjax.sim.tasks.base import Capsules, Field, SimReadings, Slot, Task, Tas
 from starjax.sim.tasks.peg_transfer.task import is_at_rest
 from starjax.sim.tasks.ring_on_wire import text
 from starjax.types import Pose
+
+if TYPE_CHECKING:  # a robot loads tasks without the simulator
+    import mujoco
 
 # As in ring_on_wire.xml (a test holds these to the compiled model).
 # y of the wire's corners
@@ -107,7 +109,7 @@ class RingBound(NamedTuple):
     radius: float
 
 
-def bind(m: mujoco.MjModel) -> RingBound:
+def bind(m: "mujoco.MjModel") -> RingBound:
     """Resolves the ids of ring and wire."""
     names = [m.geom(g).name for g in range(m.ngeom)]
     wire = [g for g, name in enumerate(names) if name.startswith(("wire", "post"))]
