@@ -72,10 +72,10 @@ def child(asked: argparse.Namespace) -> None:
     def mark(name: str) -> None:
         marks[f"{name}_s"] = time.time() - asked.child
 
-    from starjax.runtime import xla
+    from starjax.runtime import jax_start, xla
 
     xla.prepare_xla()
-    xla.require_devices("_setup", "starjax.training.loop")
+    jax_start.require_devices("_setup", "starjax.training.loop")
     import _setup
     import jax
 

@@ -103,7 +103,7 @@ def summed(driven: _far_robots.Driven, network: Network) -> dict:
 def write(asked, env, driven, told: dict, name: str, spent: float) -> dict:
     """Writes a result file; returns its strict successes of all trials."""
     from starjax import deploy
-    from starjax.commands import evaluate
+    from starjax.commands import policy_args
     from starjax.evaluation import result, statistics, trial_file, trials
     from starjax.policies import packaged, policy_file
     from starjax.runtime import files
@@ -116,7 +116,7 @@ def write(asked, env, driven, told: dict, name: str, spent: float) -> dict:
         table, env.task.is_seen, method=trained.method, observation="image", seed=asked.seed
     )
     settings = dataclasses.replace(
-        evaluate._config(trained),
+        policy_args.run_settings(trained),
         eval=config.EvalConfig(trials=asked.trials, time_limit_s=asked.seconds),
         out=str(asked.out),
     )

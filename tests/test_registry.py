@@ -1,11 +1,12 @@
 """Parts of other packages: the right type and name, from one package; a broken one is a line."""
 
 import importlib
+import re
 import sys
 
 import pytest
 
-from starjax import cli, config, errors, methods, rcm, registry
+from starjax import cli, config, errors, extensions, methods, rcm, registry
 from starjax.commands import policy_args, presets, run_settings
 from starjax.sim import registries
 
@@ -174,3 +175,35 @@ def test_a_traceback_is_shown_only_when_asked_for(capsys):
     )
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == lines[-1] and lines[1].startswith("Traceback")
+
+
+COMMAND = """
+from starjax.extensions import Subcommand
+HELLO = Subcommand("lab_i", "greets")
+def main(argv):
+    print("hello", *argv)
+    return 3
+"""
+
+
+def test_a_package_brings_a_command(install, capsys):
+    install("lab_i", COMMAND, commands="hello")
+    assert cli.dispatch(["hello", "there"]) == 3 and cli.dispatch(["--help"]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("hello there\n") and re.search(
+        r"of other packages\n  hello +greets", said
+    )
+
+
+def test_an_unknown_command_says_which_add_ons_are_here(monkeypatch):
+    table = extensions.AddOn("made up")
+    monkeypatch.setattr(extensions, "tables", lambda: {"viewer": table})
+    with pytest.raises(errors.UsageError) as caught:
+        cli.dispatch(["exprt"])
+    assert caught.value.argument == "COMMAND" and "viewer" in caught.value.hint
+
+
+def test_others_datasets_need_their_add_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(extensions, "tables", dict)
+    with pytest.raises(errors.UsageError, match="add-on formats"):
+        cli.dispatch(["inspect", str(tmp_path)])

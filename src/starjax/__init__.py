@@ -11,9 +11,21 @@ errors of a command line do without jax.
 """
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from starjax import moved
+
+if TYPE_CHECKING:  # for editors
+    from starjax import deploy, rcm
+    from starjax.api import evaluate, load_policy, train
+    from starjax.registry import Rows
+    from starjax.sim.env import make as make_env
+
+    ARMS: Rows
+    LEARNERS: Rows
+    METHODS: Rows
+    PRESETS: Rows
+    TASKS: Rows
 
 __version__ = "0.2.0"
 __all__ = (

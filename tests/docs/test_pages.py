@@ -32,7 +32,8 @@ def root(pytestconfig):
 
 def found(root):
     """Every page that a person wrote."""
-    return [*sorted(root.glob("docs/**/*.md")), root / "README.md", root / "CONTRIBUTING.md"]
+    pages = (*root.glob("docs/**/*.md"), *root.glob("src/starjax/addons/*/README.md"))
+    return [*sorted(pages), root / "README.md", root / "CONTRIBUTING.md"]
 
 
 def pytest_generate_tests(metafunc):

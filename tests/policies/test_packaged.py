@@ -145,9 +145,9 @@ def test_other_words_are_paths(folder):
 
 
 def test_a_missing_file_is_one_line_that_lists_the_names(folder, tmp_path, monkeypatch):
-    (folder / "peg_transfer_cpu.safetensors").touch()
+    (folder / "needle_pick.safetensors").touch()
     (folder / "unknown.safetensors").touch()
-    expected = "--policy: expected a file or one of compact, peg_transfer_cpu, got compcat"
+    expected = "--policy: expected a file or one of compact, needle_pick, got compcat"
     with pytest.raises(errors.UsageError) as caught:
         packaged.find("--policy", "compcat")
     assert str(caught.value).startswith(expected) and "did you mean compact" in str(caught.value)

@@ -59,6 +59,8 @@ def test_an_expert_that_takes_over_bends_the_wrist_of_the_tool_at_hand(monkeypat
     angles = rcm.angles_through(rcm.LARGE_NEEDLE_DRIVER, TIP, TROCAR)
     agent = shown(angles)()
     written = rescue.Rescuer(agent.init, agent.act)
+    one = types.SimpleNamespace(names=lambda: ["bent"], get=lambda name: TASK)
+    monkeypatch.setattr(registries, "tasks", one)
     monkeypatch.setattr(registries, "rescuers", types.SimpleNamespace(get=lambda name: written))
     assert wrists.rescuer(TASK, "bent") is written
     task = wrists.holding(TASK, scene.name("reach", ["psm"], ["prograsp"]))

@@ -141,12 +141,12 @@ def load(path: PolicyPath) -> tuple[Any, config_lib.RunConfig]:
         from starjax.deploy import external
 
         who = external.connect(path.address.removeprefix(_IN_PROCESS), path.arms)
-        return who, _settings(who.trained)
+        return who, run_settings(who.trained)
     if path.address:
         from starjax.deploy import served
 
         who = served.connect(path.address, os.environ.get(checks.API_KEY, ""), path.arms)
-        return who, _settings(who.trained)
+        return who, run_settings(who.trained)
     read = in_env.read if path.run is None else policy_evaluation.read
     trained = samples.applied(SAMPLING, read(path.file), path.sampling)
     if path.execute:
@@ -158,14 +158,14 @@ def load(path: PolicyPath) -> tuple[Any, config_lib.RunConfig]:
     method = path.run.name if path.run else ""
     who = in_env.place_in_own_scene(path.file, trained, method=method, arms=path.arms)
     if path.run is None:
-        return who, _settings(who.trained)
+        return who, run_settings(who.trained)
     config = folders.read_config(path.run)
     trained = who.trained  # another method may have trained these weights, with other settings
     demos = trained.demos or config.demos
     return who, dataclasses.replace(config, policy=trained.policy, train=trained.train, demos=demos)
 
 
-def _settings(trained: Any) -> config_lib.RunConfig:
+def run_settings(trained: Any) -> config_lib.RunConfig:
     """Returns the settings of a policy's run, as far as its file has them."""
     settings = config_lib.RunConfig(
         method=trained.method,

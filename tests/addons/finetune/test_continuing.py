@@ -16,7 +16,7 @@ KEYS = jax.random.split(jax.random.key(4), 12)
 
 
 @pytest.fixture(scope="module")
-def found(reset, bench_takeover):
+def found(reset, takeover):
     """Demonstrations without physics: tips follow their commands, closed jaws move the block."""
 
     def step(carry, _):
@@ -47,25 +47,25 @@ def found(reset, bench_takeover):
         return jax.lax.scan(step, (expert.AGENT.init(key, state), state), None, STEPS)[1]
 
     swapped = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), episode(KEYS, reset(6)))
-    return bench_takeover.Episodes(*swapped)
+    return takeover.Episodes(*swapped)
 
 
 @pytest.fixture(scope="module")
-def bench_takeover(pytestconfig):
+def takeover(pytestconfig):
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(pytestconfig.rootpath / "benchmarks")
-        import bench_takeover
+        patch.syspath_prepend(pytestconfig.rootpath / "experiments" / "fine_tuning")
+        import takeover
 
-        return bench_takeover
+        return takeover
 
 
 @pytest.mark.slow
-def test_the_expert_of_peg_transfer_continues_a_demonstration(found, bench_takeover):
-    gaps = bench_takeover.compared(rescue.RESCUER, found)
-    is_beyond = gaps.velocity > bench_takeover.TOLERANCE
+def test_the_expert_of_peg_transfer_continues_a_demonstration(found, takeover):
+    gaps = takeover.compared(rescue.RESCUER, found)
+    is_beyond = gaps.velocity > takeover.TOLERANCE
     phases = {phase: (gaps.stage == phase) for phase in range(expert.WAIT)}
     assert all(phases[p].sum() > 5 for p in (1, 2, expert.LIFT, expert.CARRY, expert.LOWER))
-    assert np.median(gaps.velocity) < bench_takeover.TOLERANCE / 4
+    assert np.median(gaps.velocity) < takeover.TOLERANCE / 4
     assert is_beyond.mean() < 0.06 and not is_beyond[phases[expert.DESCEND]].any()
 
 

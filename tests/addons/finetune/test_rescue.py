@@ -5,25 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax import rcm
 from starjax.addons.finetune.rescuers import peg_transfer as rescue
-from starjax.sim import env as envs
 from starjax.sim.tasks import phases, scripting
 from starjax.sim.tasks.peg_transfer import expert, task
 from starjax.types import Pose
 
 KEYS = jax.random.split(jax.random.key(3), 12)
-
-
-@pytest.fixture(scope="module")
-def reset():
-    """`seed -> EnvState` of the twelve trocars."""
-    environment = envs.make(observation="state")
-    trocars = jax.tree.map(lambda x: jnp.asarray(x)[:, None], rcm.TROCARS)
-    compiled = jax.jit(jax.vmap(environment.reset))
-    return lambda seed: compiled(
-        jax.random.split(jax.random.key(seed), 12), envs.EnvParams(trocars, None)
-    )
 
 
 @pytest.fixture(scope="module")

@@ -1,15 +1,14 @@
 """`starjax six-blocks` with a stub of its environment."""
 
 import json
+import types
 
-import fakes
 import jax.numpy as jnp
 import mistakes
 import pytest
 import stubs
 
 from starjax.addons.six_blocks import command, environment, task
-from starjax.policies import policy_file
 
 
 @pytest.fixture
@@ -19,8 +18,10 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_the_exercise_is_for_policies_of_its_task(folder):
-    policy_file.save(folder / "mine.safetensors", fakes.trained())
+def test_the_exercise_is_for_policies_of_its_task(folder, monkeypatch):
+    (folder / "mine.safetensors").touch()
+    who = types.SimpleNamespace(env=stubs.make_env(), trained=None)
+    monkeypatch.setattr(command.policy_args, "load", lambda path: (who, None))
     with mistakes.of("RUN or --policy", "one for reach"):
         command.main(["--policy", "mine.safetensors"])
 

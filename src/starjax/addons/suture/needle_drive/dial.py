@@ -3,7 +3,7 @@
 The needle's arc passes both marks in any plane through them: the plane's lean is free. One lean
 serves all trocars up to a turn of 117 degrees; from 133 on none does, and the expert's lean suits
 the trocar. A second expert keeps one lean. The jaws hold the wire level with the arc's centre when
-the point leaves, as in `benchmarks/bench_dial.py`.
+the point leaves, as in `experiments/wrist/dial/bites.py`.
 """
 
 import functools

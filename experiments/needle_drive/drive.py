@@ -1,6 +1,6 @@
 """A driven needle in our physics and in C MuJoCo: the same commands of the expert, side by side.
 
-    python benchmarks/bench_drive.py [--per-trocar 3] [--task needle_drive] [--arm psm]
+    python experiments/needle_drive/drive.py [--per-trocar 3] [--task needle_drive] [--arm psm]
 
 The expert drives a needle through the pad in our physics. Its commands are then repeated in C
 MuJoCo: entry, exit and force across the hole of both, and how far apart the two needles are. The
@@ -8,8 +8,11 @@ forces of pad and jaws are the same program in both; the physics step around it 
 """
 
 import argparse
+import pathlib
+import sys
 from typing import Any
 
+sys.path.append(str(pathlib.Path(__file__).parents[2] / "benchmarks"))
 import _c_env
 import _scene
 import _timing

@@ -1,7 +1,7 @@
 """Draws how far the trocar moves the expert's wanted tip in each phase, from a result of
-`bench_proposition.py`.
+`proposition.py`.
 
-python benchmarks/proposition_figure.py results/proposition_cpu.json FIGURE.png
+python experiments/methods/proposition_figure.py results/proposition_cpu.json FIGURE.png
 """
 
 import json

@@ -1,6 +1,6 @@
 """Success of scripted experts by arm and tool with a wrist, in C MuJoCo.
 
-    python benchmarks/bench_arms.py [--only ur5e/needle_driver/needle_drive ...] \\
+    python experiments/experts/arms.py [--only ur5e/needle_driver/needle_drive ...] \\
         [--per-trocar 2] [--sampled 16] [--seed 2026]
 
 The tool takes the place of a task's own. Rows of other runs stay. No peer, no time.
@@ -8,8 +8,11 @@ The tool takes the place of a task's own. Rows of other runs stay. No peer, no t
 
 import argparse
 import itertools
+import pathlib
+import sys
 from typing import Any
 
+sys.path.append(str(pathlib.Path(__file__).parents[2] / "benchmarks"))
 import _c_env
 import _timing
 import jax

@@ -1,6 +1,7 @@
 """Rescuers in the middle of demonstrations, which they should continue.
 
-    python benchmarks/bench_takeover.py [--episodes 12] [--task peg_transfer] [--arm A] [--tool T]
+    python experiments/fine_tuning/takeover.py [--episodes 12] [--task peg_transfer] \\
+        [--arm A] [--tool T]
 
 An expert's episodes run in C MuJoCo's physics. At every `EVERY`-th control step the rescuer enters
 and sees the episode's next states; its labels should be those of the demonstration. Rows are the
@@ -8,9 +9,12 @@ stages of the task in the episodes. No time.
 """
 
 import argparse
+import pathlib
+import sys
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+sys.path.append(str(pathlib.Path(__file__).parents[2] / "benchmarks"))
 import _c_env
 import _scene
 import _timing

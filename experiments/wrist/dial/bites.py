@@ -1,6 +1,6 @@
 """The dial: how far a needle turns decides if one grasp serves every trocar.
 
-    python benchmarks/bench_dial.py [--tiny]
+    python experiments/wrist/dial/bites.py [--tiny]
 
 A needle of needle pick's radius enters a level pad at the board's middle, turns along its arc and
 leaves: from 10 degrees before its point enters to 20 degrees after it left. The depth of the arc's
@@ -13,8 +13,11 @@ trocars, one for all twelve? Closed form, no simulation, no time.
 """
 
 import argparse
+import pathlib
+import sys
 from typing import Any
 
+sys.path.append(str(pathlib.Path(__file__).parents[3] / "benchmarks"))
 import _timing
 import jax
 import jax.numpy as jnp

@@ -1,6 +1,6 @@
 """Starts of needle regrasp that one arm can take square, in closed form, at every trocar.
 
-    python benchmarks/bench_regrasp.py [--starts 4000] [--sampled 500] [--tiny]
+    python experiments/wrist/regrasp/starts.py [--starts 4000] [--sampled 500] [--tiny]
 
 Starts are drawn as the task draws them, at any yaw and up to 30 degrees of tilt, as many at every
 trocar. One arm can take a start if the expert's grasp is square and the wrist within its limits,
@@ -8,9 +8,12 @@ palm and shaft clear of the plate. No simulation, no time.
 """
 
 import argparse
+import pathlib
+import sys
 import types
 from typing import Any
 
+sys.path.append(str(pathlib.Path(__file__).parents[3] / "benchmarks"))
 import _timing
 import jax
 import jax.numpy as jnp

@@ -1,13 +1,16 @@
 """Pixels of both marks of needle drive, by camera, before and during the drive.
 
-    python benchmarks/bench_marks.py
+    python experiments/needle_drive/marks.py
 
 The expert drives a needle through each of the twelve trocars. Every fourth control step is drawn by
 each camera, at the size of the packaged policies' images. No time.
 """
 
 import functools
+import pathlib
+import sys
 
+sys.path.append(str(pathlib.Path(__file__).parents[2] / "benchmarks"))
 import _timing
 import jax
 import jax.numpy as jnp

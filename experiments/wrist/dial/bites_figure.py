@@ -1,7 +1,7 @@
 """Draws the directions that one grasp serves against the needle's turn, from a result of
-`bench_dial.py`.
+`bites.py`.
 
-python benchmarks/dial_figure.py results/dial_cpu.json FIGURE.png
+python experiments/wrist/dial/bites_figure.py results/dial_cpu.json FIGURE.png
 """
 
 import json

@@ -1,6 +1,6 @@
 """Success of the dial's two experts by the turn of the needle, at the task's trocars and others.
 
-    python benchmarks/bench_turns.py [--expert default] [--per-trocar 60] [--sampled 600] \\
+    python experiments/wrist/dial/turns.py [--expert default] [--per-trocar 60] [--sampled 600] \\
         [--seed 2026] [--c] [--tiny]
 
 The task is needle drive along the dial. One expert (`default`) drives each needle in a plane that
@@ -9,7 +9,10 @@ episodes whose wrist stays within its limits in that plane, in closed form.
 """
 
 import argparse
+import pathlib
+import sys
 
+sys.path.append(str(pathlib.Path(__file__).parents[3] / "benchmarks"))
 import _c_env
 import _timing
 import jax

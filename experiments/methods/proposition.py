@@ -1,6 +1,6 @@
 """Where Proposition 1 holds: the share of the expert's wanted tip position that the trocar decides.
 
-    python benchmarks/bench_proposition.py --task needle_pick [--scenes 16] [--seed 2026] [--c]
+    python experiments/methods/proposition.py --task needle_pick [--scenes 16] [--seed 2026] [--c]
 
 The proposition says that the wanted position does not depend on the trocar. So each of some scenes
 is played at every trocar of the task, with the same objects, the same choices of the expert and the
@@ -28,9 +28,12 @@ knows more, so the share bounds from above what is lost by not telling it the tr
 
 import argparse
 import importlib
+import pathlib
+import sys
 from collections.abc import Callable
 from typing import Any
 
+sys.path.append(str(pathlib.Path(__file__).parents[2] / "benchmarks"))
 import _c_env
 import _decomposition
 import _scene

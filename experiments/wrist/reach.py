@@ -1,6 +1,6 @@
 """Reach of arms with wristed tools, and the executed error of their shafts along a needle's arc.
 
-    python benchmarks/bench_wrist.py [--only fr5/needle_driver ...]
+    python experiments/wrist/reach.py [--only fr5/needle_driver ...]
 
 Reach: fraction of tip poses over the board that inverse kinematics reaches among those that the
 wrist allows, for axes of the jaws within a tilt of straight down, any yaw, at the paper's twelve
@@ -10,8 +10,11 @@ in 4 s through each trocar, in C MuJoCo with the environment's own controller. N
 
 import argparse
 import itertools
+import pathlib
+import sys
 from typing import Any
 
+sys.path.append(str(pathlib.Path(__file__).parents[2] / "benchmarks"))
 import _c_env
 import _timing
 import jax

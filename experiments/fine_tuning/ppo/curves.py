@@ -1,18 +1,20 @@
 """How fast examples/11_ppo.py learns reach, from several seeds.
 
-python benchmarks/bench_ppo.py [--seeds 3] [the example's own flags]
+python experiments/fine_tuning/ppo/curves.py [--seeds 3] [the example's own flags]
 """
 
 import argparse
 import json
+import pathlib
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+sys.path.append(str(pathlib.Path(__file__).parents[3] / "benchmarks"))
 import _timing
 
-EXAMPLE = Path(__file__).parents[1] / "examples" / "11_ppo.py"
+EXAMPLE = Path(__file__).parents[3] / "examples" / "11_ppo.py"
 
 
 def main() -> None:
