@@ -12,7 +12,6 @@ from types import ModuleType
 from typing import Any
 
 _SUFFIXES = (".py", ".xml", ".toml", ".json")
-_INSTALLED = {"site-packages", "dist-packages"}
 _started = time.time()  # of this process, about
 
 
@@ -57,12 +56,16 @@ def _files(package: str) -> tuple[Path, ...]:
     if spec is None or not (places := spec.submodule_search_locations or [spec.origin or ""]):
         raise Missing(f"no files of {package}")
     roots = [Path(place) for place in places]
-    if package not in {"starjax", *providers()} and any(
-        _INSTALLED & {*root.parts} for root in roots
-    ):
+    own = {"starjax", *providers()}
+    if package not in own and any(_is_installed(root) for root in roots):
         return ()
     inside = (path for root in roots for path in [root, *root.rglob("*")])
     return tuple(sorted(path for path in inside if path.suffix in _SUFFIXES))
+
+
+def _is_installed(root: Path) -> bool:
+    """Returns True for a folder or module next to the records of installed packages."""
+    return next(root.parent.glob("*.dist-info"), None) is not None
 
 
 @functools.cache
@@ -86,5 +89,8 @@ def _used(package: str) -> set[str]:
 
 
 def _owner(value: Any) -> str:
-    name = value.__name__ if isinstance(value, ModuleType) else getattr(value, "__module__", "")
+    try:
+        name = value.__name__ if isinstance(value, ModuleType) else value.__module__
+    except Exception:  # a stand-in for a package that is absent raises what it likes
+        return ""
     return name if isinstance(name, str) else ""
