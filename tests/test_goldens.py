@@ -2,13 +2,12 @@
 
     python tests/test_goldens.py PART...    writes tests/golden/identity/PART.json anew
 
-- A file's part `source` (digests of code) and `model` (bytes of the compiled MJCF) may change by
-  intent with a move; everything else of a dataset's description is what users' files are found by.
+- `model` (bytes of the compiled MJCF) stands apart from what users' files are found by. Versions
+  and digests of code are those of runtime/accepted.json.
 - `steps`, `losses` and `trials` hold to the last bit on the machine that wrote them (`machine`),
   and within `TOLERANCE` on others.
-- A commit that changes an expert rewrites `steps` and `trials` and leaves the digests of
-  golden/benchmark.json; one that changes these digests leaves `trials`, which shows that version 1
-  of the benchmark still means the same.
+- A commit that changes an expert rewrites `steps` and `trials` and leaves golden/benchmark.json;
+  one that changes the digests there leaves `trials`: version 1 still means the same.
 """
 
 import ast
@@ -48,8 +47,9 @@ OLD = HERE / "golden" / "opened" / "run_4bec7307.zip"
 SOURCE = HERE.parent / "src" / "starjax"
 DIGITS = 12  # of a digest
 SHORT = 60  # characters of a value that a golden file shows as it is
-# Of the machine and its packages.
+# Values of the machine and its packages.
 VOLATILE = ("versions", "jax_settings", "platform", "lanes", "chunk", "command")
+CODE = ("parts", "source")  # runtime/accepted.json has them
 STEPS, LOSSES, TRIALS, LANES = 30, 100, 3, 8
 # On another machine: m of a tip after `STEPS`, parts of a loss, trials of a task's 36, parts of
 # their mean length.
@@ -61,7 +61,7 @@ def datasets() -> dict[str, Any]:
 
     Of states; one more of images.
     """
-    found = {"source": {}, "model": {}, "described": {}}
+    found = {"model": {}, "described": {}}
     kinds = [(name, "state") for name in registries.tasks.names()] + [("peg_transfer", "image")]
     for name, observation in kinds:
         made = env.make(name, observation=observation)
@@ -69,7 +69,6 @@ def datasets() -> dict[str, Any]:
             settings = schema.DemoSettings(per_trocar=1, seed=0, max_steps=10, expert=expert)
             described = plain(schema.describe(made, made.task.trocars, settings))
             key = f"{name}.{expert}.{observation}"
-            found["source"][key] = described.pop("source")
             found["model"][key] = described.pop("model")[:DIGITS]
             found["described"][key] = shortened(described)
     return found
@@ -98,7 +97,7 @@ def plans() -> dict[str, Any]:
     def stop(*_: Any, **__: Any) -> None:
         raise Planned
 
-    found = {"source": {}, "model": {}}
+    found = {"model": {}}
     for command, more in {"evaluate": [], "sweep": grid}.items():
         with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
             patch.chdir(folder)
@@ -107,7 +106,6 @@ def plans() -> dict[str, Any]:
                 cli.load(command)([*words, *more])
             (path,) = pathlib.Path(folder).rglob("plan.json")
             plan = json.loads(path.read_text())
-        found["source"][command] = plan.pop("source")
         found["model"][command] = plan.pop("model")[:DIGITS]
         found[command] = shortened(plan)
     return found
@@ -230,7 +228,7 @@ def machine() -> dict[str, Any]:
 
 def shortened(values: dict[str, Any]) -> dict[str, Any]:
     """Returns JSON values without those of the machine, digests in place of long ones."""
-    kept = {name: value for name, value in values.items() if name not in VOLATILE}
+    kept = {name: value for name, value in values.items() if name not in VOLATILE + CODE}
     return {n: v if len(json.dumps(v)) <= SHORT else digest(v) for n, v in kept.items()}
 
 

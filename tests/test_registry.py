@@ -117,8 +117,8 @@ def test_methods_spaces_presets_encoders_and_policies_are_parts_too(install, cap
     assert (row.weights_of, row.label, row.keeps_to_manifold) == ("blind", "blind", True)
     assert list(methods.METHODS)[-1] == "blind" and "blind" not in methods.TABLE_II
     assert list(methods.SCORED).index(methods.SERVED) < list(methods.SCORED).index("blind")
-    assert methods.paths("blind") == ["lab_i:BLIND", "lab_i:RCM4_AGAIN"]
-    assert not any(methods.paths("stardiff"))
+    assert [part.code for part in methods.parts("blind")] == ["lab_i:BLIND", "lab_i:RCM4_AGAIN"]
+    assert not any(part.code for part in methods.parts("stardiff"))
     argv = ["--preset", "brief", "--method", "blind", "--policy.encoder", "tiny"]
     config = run_settings.parse("run", [*argv, "--out", str(tmp_path / "out")], "")
     assert (config.preset, config.seed, config.method) == ("brief", 3, "blind")

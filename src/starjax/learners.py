@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from starjax import methods
 from starjax.registry import Registry
+from starjax.runtime import sources
 
 
 class Learner(NamedTuple):
@@ -22,11 +23,13 @@ class Learner(NamedTuple):
       check: (options, PolicyConfig) -> None; raises UsageError for options that do not go together
         or with the policy's. It imports no jax.
       make: (options, PolicyConfig, policies.sequences.Sizes) -> policies.sequences.SequenceModel.
+      version: raised with a change of its loss or samples; a training continues under an equal one.
     """
 
     settings: type
     check: Callable[[Any, Any], None]
     make: Callable[[Any, Any, Any], Any]
+    version: int = 1
 
 
 LEARNERS = Registry(
@@ -51,10 +54,10 @@ ENCODERS = Registry(
 )
 
 
-def parts(method: str, learner: str, *encoders: str) -> list[str]:
-    """Returns the `module:object` of each part of a policy, for `runtime.sources`.
+def parts(method: str, learner: str, *encoders: str) -> list[sources.Identity]:
+    """Returns the identity of each part of a policy.
 
     Empty names of encoders are those that it lacks.
     """
-    used = [ENCODERS.path(name) for name in encoders if name]
-    return [LEARNERS.path(learner), *used, *methods.paths(method)]
+    used = [sources.identity(ENCODERS, name) for name in encoders if name]
+    return [sources.identity(LEARNERS, learner), *used, *methods.parts(method)]

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from starjax.registry import Registry, Rows
+from starjax.runtime import sources
 
 
 class Method(NamedTuple):
@@ -167,8 +168,8 @@ def behaviour(name: str) -> Method:
     return SCORED[name]._replace(label="", group="")
 
 
-def paths(name: str) -> list[str]:
-    """Returns the `module:object` of a method and its action space, empty for those of starjax."""
+def parts(name: str) -> list[sources.Identity]:
+    """Returns the identity of a method and its action space, without code for those of starjax."""
     row = SCORED.get(name)
-    space = Registry("action_space", {}).path(row.action_space) if row else ""
-    return [Registry("method", {}).path(name), space]
+    kinds = {"method": name, "action_space": row.action_space if row else ""}
+    return [sources.identity(Registry(kind, {}), part) for kind, part in kinds.items()]

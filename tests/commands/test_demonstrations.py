@@ -10,7 +10,6 @@ import stubs
 from starjax import config, errors
 from starjax.commands import demonstrations, presets
 from starjax.rollouts import sharing
-from starjax.runtime import sources
 from starjax.sim import registries
 
 SMOKE = presets.PRESETS["smoke"]
@@ -74,12 +73,12 @@ def test_demonstrations_are_those_that_were_asked_for(tmp_path, monkeypatch, see
     assert {name: settings._asdict()[name] for name in wanted} == wanted
 
 
-def test_an_edit_of_the_tasks_code_asks_for_new_demonstrations(tmp_path, monkeypatch):
+def test_another_version_of_the_expert_asks_for_new_demonstrations(tmp_path):
     chosen, env = dataclasses.replace(SMOKE, out=str(tmp_path)), stubs.make_env()
     before = demonstrations.plan(chosen, env, sharing.ALONE).root
     assert demonstrations.plan(chosen, env, sharing.ALONE).root == before
-    monkeypatch.setattr(sources, "digests", lambda *_: {"mylab": "edited"})
-    assert demonstrations.plan(chosen, env, sharing.ALONE).root != before
+    raised = env._replace(task=env.task._replace(expert_version=2))
+    assert demonstrations.plan(chosen, raised, sharing.ALONE).root != before
 
 
 def test_an_expert_that_the_task_lacks_is_a_mistake(tmp_path):

@@ -81,6 +81,17 @@ def test_weights_of_other_settings_of_jax_are_refused(tmp_path, monkeypatch):
     assert caught.value.argument == "the settings of jax" and "NVIDIA" in str(caught.value.got)
 
 
+@pytest.mark.parametrize(("name", "argument"), [("source", "{}"), ("parts", "the version of {}")])
+def test_weights_of_another_learner_are_refused(tmp_path, name, argument):
+    claimed(tmp_path)
+    recorded = files.read_json(tmp_path / "config.json")
+    (learner,) = (part for part in recorded["source"] if part.startswith("learner"))
+    recorded[name][learner] = 0
+    files.write_json(tmp_path / "config.json", recorded)
+    with mistakes.of(argument.format(learner)):
+        folders.claim(tmp_path, SMOKE, "demos-a")
+
+
 def test_weights_of_another_frozen_encoder_are_refused(tmp_path):
     claimed(tmp_path, "aaaa")
     folders.claim(tmp_path, SMOKE, "demos-a")  # trained by now: the encoder may be gone

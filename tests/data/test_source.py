@@ -1,28 +1,24 @@
-"""A digest of the source in dataset.json: compared only where both descriptions have it."""
+"""Versions of parts name a dataset; other code of an equal version is refused."""
 
 import pytest
 
+from starjax import errors
 from starjax.data import store
 from starjax.runtime import files
 
-OLD = {"schema": store.SCHEMA, "seed": 0, "versions": {}}
-NEW = OLD | {"source": {"mylab": "a"}}
-EDITED = OLD | {"source": {"mylab": "b"}}
+OLD = {"schema": store.SCHEMA, "seed": 0, "versions": {}, "source": {"starjax": "a"}}
+NEW = OLD | {"parts": {"task reach": 1}, "source": {"task reach": "a"}}
+EDITED = NEW | {"source": {"task reach": "b"}}
+RAISED = EDITED | {"parts": {"task reach": 2}}
 
 
-def test_a_dataset_of_other_source_is_another(tmp_path):
-    assert len({store.digest(x) for x in (OLD, NEW, EDITED)}) == 3
+def test_a_dataset_of_another_version_is_another(tmp_path):
+    assert store.digest(NEW) == store.digest(EDITED)
+    assert len({store.digest(x) for x in (OLD, NEW, RAISED)}) == 3
     store.create(tmp_path, NEW)
     store.create(tmp_path, NEW)
-    store.create(tmp_path, OLD)
-    with pytest.raises(files.StorageError):
+    with pytest.raises(errors.UsageError) as refused:
         store.create(tmp_path, EDITED)
-
-
-def test_a_dataset_without_it_is_used_as_before(tmp_path):
-    folder = store.folder(tmp_path, NEW)
-    assert folder == tmp_path / f"demos-{store.digest(NEW)}"
-    older = tmp_path / f"demos-{store.digest(OLD)}"
-    store.create(older, OLD)
-    assert store.folder(tmp_path, NEW) == store.folder(tmp_path, EDITED) == older
-    store.create(older, NEW)
+    assert refused.value.argument == "task reach"
+    with pytest.raises(files.StorageError):
+        store.create(tmp_path, RAISED)

@@ -12,6 +12,7 @@ import fakes
 import jax
 import jax.numpy as jnp
 import kill
+import mistakes
 import numpy as np
 import pytest
 import stubs
@@ -196,6 +197,20 @@ def test_another_simulator_starts_afresh(tmp_path, whole, monkeypatch, what):
     said = []
     assert_same(run(tmp_path, chunk=3, report=said.append), whole[1])
     assert "2 chunks of another evaluation" in said[0]
+
+
+@pytest.mark.parametrize("name", ["source", "parts"])
+def test_trials_of_other_code_are_refused_unless_its_version_is_another(tmp_path, whole, name):
+    shutil.copytree(whole[0], tmp_path, dirs_exist_ok=True)
+    plan = json.loads((tmp_path / "plan.json").read_text())
+    task, *_ = plan["source"]
+    plan[name][task] = 0
+    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    if name == "source":
+        with mistakes.of(task):
+            run(tmp_path, video_trials=4)
+    else:
+        assert_same(run(tmp_path, video_trials=4), whole[1])
 
 
 def test_a_damaged_chunk_is_named_and_run_again(tmp_path, whole):

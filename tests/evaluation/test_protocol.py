@@ -46,7 +46,7 @@ CHANGED = (
 def code(*patterns: str) -> str:
     files = [file for pattern in patterns for file in sorted(SOURCE.glob(pattern))]
     assert files, patterns
-    return sources.digest("", files)
+    return sources.digest(files)
 
 
 def mjcf() -> str:

@@ -139,5 +139,6 @@ def _cameras_of(task: str) -> Sequence[str]:
 def _title(kind: str, name: str) -> str:
     registry: Any = _kinds()[kind].registry()
     path = registry.path(name) if registry else ""
-    versions = "".join(f", {package} {of}" for package, of in sources.versions(path).items())
+    packages = sources.packages([sources.Identity(name, 0, path)])
+    versions = "".join(f", {package} {of}" for package, of in packages.items())
     return f"{kind} {name}" + f" ({path}{versions})" * bool(path)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from starjax import config as config_lib
 from starjax import errors
 from starjax.commands import messages, stage_times
-from starjax.runtime import hub
+from starjax.runtime import hub, sources
 
 _FROM, _RANDOMISE = "demos.from_", "demos.randomise"
 
@@ -42,7 +42,7 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> DemosWork:
     from starjax.sim import env as sim_env
     from starjax.sim import registries, task_draws
 
-    env, max_levels = randomised(config, env)
+    env, max_levels, disturbances = randomised(config, env)
     if config.policy.observation == "image":
         env = sim_env.without_images(env)  # training draws them: collecting waits for no camera
     task, name = env.task, config.demos.expert or next(iter(env.task.experts))
@@ -55,6 +55,7 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> DemosWork:
         keep_failures=config.demos.keep_failures,
         expert=name,
         randomise=max_levels,
+        disturbances=disturbances,
     )
     expert = agent.from_single(task.expert(name))
     out = Path(config.out)
@@ -124,9 +125,11 @@ def size(config: config_lib.RunConfig, task: Any) -> tuple[int, int]:
     return count, demos.rows(count, config.demos.max_steps)
 
 
-def randomised(config: config_lib.RunConfig, env: Any) -> tuple[Any, dict[str, float]]:
-    """Returns the environment for recording demonstrations, and the maximum levels of its
-    disturbances as datasets hold them.
+def randomised(
+    config: config_lib.RunConfig, env: Any
+) -> tuple[Any, dict[str, float], tuple[sources.Identity, ...]]:
+    """Returns the environment for recording demonstrations, the maximum levels of its
+    disturbances as datasets hold them, and their identities.
 
     Raises:
       errors.UsageError: a disturbance of observations or of measured trocars, or no such level.
@@ -143,10 +146,11 @@ def randomised(config: config_lib.RunConfig, env: Any) -> tuple[Any, dict[str, f
         base.check_tools(_RANDOMISE, name, env.names.tools)
         base.check_levels(_RANDOMISE, name, [level])
     if not max_levels:
-        return env, {}
+        return env, {}, ()
     # Datasets hold the names that seed the draws: renamed disturbances leave their digests alone.
     recorded = {base.stream(name): level for name, level in max_levels.items()}
-    return base.with_random_levels(env, max_levels), recorded
+    parts = tuple(sources.identity(DISTURBANCES, name) for name in max_levels)
+    return base.with_random_levels(env, max_levels), recorded, parts
 
 
 def _changes_demos(kind: Any) -> bool:

@@ -20,7 +20,8 @@ _BESIDE = (
     "dataset",
     "encoder",
     "jax_settings",
-    "learner_source",
+    "parts",
+    "source",
 )  # further entries of a config.json
 
 
@@ -101,7 +102,7 @@ def claim(
 
     policy = config.policy
     networks = policy.learner, policy.encoder, policy.depth_encoder
-    source = sources.digests(*learners.parts(folder.name, *networks))
+    now_parts = sources.record(learners.parts(folder.name, *networks))
     started = (folder / "policy.safetensors").exists() or any(folder.glob("checkpoints/step_*"))
     recorded = _recorded(folder) if (folder / "config.json").exists() else {}
     if started and not recorded:
@@ -114,13 +115,16 @@ def claim(
         settings = (record.get("jax_settings", {}) for record in (recorded, jax_settings.record()))
         _refuse(folder, "the settings of jax", *settings)
         _refuse(folder, "the demonstrations", recorded.get("dataset", dataset), dataset)
-        _refuse(folder, "the learner's code", recorded.get("learner_source", source), source)
+        for name, version in now_parts["parts"].items():
+            before_version = recorded.get("parts", {}).get(name, version)
+            _refuse(folder, f"the version of {name}", before_version, version)
+        sources.refuse_other_code(folder / "config.json", recorded, now_parts)
         encoder_before = recorded.get("encoder") or encoder
         _refuse(folder, "policy.encoder_weights", encoder_before, encoder or encoder_before)
     known = recorded.get("encoder") if started or config.policy.freeze_encoder else None
     frozen = encoder or known
     extra = (
-        {"dataset": dataset, **({"learner_source": source} if source else {})}
+        {"dataset": dataset, **now_parts}
         | ({"encoder": frozen} if frozen else {})
         | jax_settings.record()
     )

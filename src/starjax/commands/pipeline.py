@@ -209,12 +209,14 @@ def _train(
         roll_zero=tuple(slot.roll_zero for slot in env.task.slots),
         demos=config.demos,
         preset=config.preset,
-        packages=sources.versions(
-            *registries.paths(env.names),
-            *learners.parts(
-                *(name, config.policy.learner, config.policy.encoder),
-                config.policy.depth_encoder,
-            ),
+        packages=sources.packages(
+            [
+                *registries.parts(env.names),
+                *learners.parts(
+                    *(name, config.policy.learner, config.policy.encoder),
+                    config.policy.depth_encoder,
+                ),
+            ]
         ),
     )
     share.first(f"{name} is saved", lambda: policy_file.save(weights, trained))

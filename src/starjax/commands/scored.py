@@ -14,14 +14,16 @@ def is_complete(config: config_lib.RunConfig, folder: Path, weights: Path, env: 
     """Returns True if the result of a method is complete.
 
     Raises:
-      errors.UsageError: fewer trials would replace it.
+      errors.UsageError: fewer trials would replace it, or a part's code is another under an equal
+        version.
     """
     from starjax.evaluation import result
 
     scored = _read(folder, files.sha256(weights))
-    source = sources.digests(*result.parts_of(env.names, config_json.as_json(config)))
-    is_current = scored and scored.about.get("source", source) == source
+    now = sources.record(result.parts_of(env.names, config_json.as_json(config)))
+    is_current = scored and scored.about.get("parts", now["parts"]) == now["parts"]
     if is_current and _is_of(scored, config):
+        sources.refuse_other_code(folder / "result.json", scored.about, now)
         return True
     count = len(env.task.is_seen)
     if scored and (more := len(scored.trials)) > count * config.eval.trials:

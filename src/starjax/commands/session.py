@@ -64,11 +64,11 @@ class Session(NamedTuple):
         from starjax.sim import names, registries
 
         scene = content.get("scene")
-        parts = registries.paths(names.SceneNames(**scene)) if scene else []
+        parts = registries.parts(names.SceneNames(**scene)) if scene else []
         made_by = {
             "command": self.command,
             **provenance.code()._asdict(),
-            "versions": {**xla.versions(), **sources.versions(*parts)},
+            "versions": {**xla.versions(), **sources.packages(parts)},
             "hardware": xla.hardware(),
             **jax_settings.record(),
         }

@@ -11,7 +11,6 @@ import numpy as np
 from starjax import errors
 from starjax.data import store
 from starjax.rcm.trocar import Trocar
-from starjax.registry import Registry
 from starjax.rollouts import episodes, programs
 from starjax.runtime import jax_settings, sources, xla
 from starjax.sim import registries
@@ -28,9 +27,7 @@ def seed_rule(stream: int) -> str:
 
 
 SEED_RULE = seed_rule(STREAM)
-
-
-_DISTURBANCES = Registry("disturbance", {})  # of other packages
+_NESTED = ("randomise", "disturbances")  # settings that are described in another form
 
 
 class DemoSettings(NamedTuple):
@@ -43,6 +40,7 @@ class DemoSettings(NamedTuple):
       keep_failures: store failed episodes too.
       expert: key of `Task.experts`; empty for the first one.
       randomise: maximum levels of disturbances by name.
+      disturbances: identities of these.
     """
 
     per_trocar: int
@@ -51,6 +49,7 @@ class DemoSettings(NamedTuple):
     keep_failures: bool = False
     expert: str = ""
     randomise: Mapping[str, float] = types.MappingProxyType({})
+    disturbances: tuple[sources.Identity, ...] = ()
 
 
 def describe(env: Any, trocars: Trocar, settings: DemoSettings) -> dict[str, Any]:
@@ -61,10 +60,13 @@ def describe(env: Any, trocars: Trocar, settings: DemoSettings) -> dict[str, Any
       trocars: fields `[C, A]`.
     """
     frame = programs.frame(env, episodes.DEMONSTRATION)
+    expert = expert_name(env.task, settings)
     parts = [
-        *registries.paths(env.names),
-        env.task.experts[expert_name(env.task, settings)],
-        *(_DISTURBANCES.path(name) for name in settings.randomise),
+        *registries.parts(env.names),
+        sources.Identity(
+            f"expert {env.task.name}.{expert}", env.task.expert_version, env.task.experts[expert]
+        ),
+        *settings.disturbances,
     ]
     features = {
         name: {
@@ -76,10 +78,10 @@ def describe(env: Any, trocars: Trocar, settings: DemoSettings) -> dict[str, Any
     }
     return {
         "schema": store.SCHEMA,
-        **{name: x for name, x in settings._asdict().items() if name != "randomise"},
+        **{name: x for name, x in settings._asdict().items() if name not in _NESTED},
         # Omitted if empty, so digests of datasets without disturbances hold.
         **({"randomise": dict(settings.randomise)} if settings.randomise else {}),
-        "expert": expert_name(env.task, settings),
+        "expert": expert,
         "scene": env.names._asdict(),
         "trocars": np.stack([np.asarray(f, np.float64) for f in trocars], -1).tolist(),
         "p_world_ref": np.asarray(env.p_world_ref, np.float64).tolist(),
@@ -93,8 +95,8 @@ def describe(env: Any, trocars: Trocar, settings: DemoSettings) -> dict[str, Any
         "features": features,
         "model": model_hash(env.scene),
         "seed_rule": SEED_RULE,
-        "source": sources.digests(*parts),
-        "versions": {**xla.versions(), **sources.versions(*parts)},
+        **sources.record(parts),
+        "versions": {**xla.versions(), **sources.packages(parts)},
         **jax_settings.record(),
     }
 

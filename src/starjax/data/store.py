@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from starjax import errors
-from starjax.runtime import files, xla
+from starjax.runtime import files, sources, xla
 
 SCHEMA = 2
 _KEY = re.compile(r"\d{4,}-\d{4,}-\d+")  # what `key` gives
@@ -44,14 +44,13 @@ def is_key(name: object) -> bool:
 
 
 def digest(description: Mapping[str, Any]) -> str:
-    """Returns twelve hexadecimal digits of a description, without software versions."""
-    return _hash({k: v for k, v in description.items() if k != "versions"})[:12]
+    """Returns twelve hexadecimal digits of a description, without versions and digests of code."""
+    return _hash({k: v for k, v in description.items() if k not in ("versions", "source")})[:12]
 
 
 def folder(out: Path, description: Mapping[str, Any]) -> Path:
-    """Returns the folder of a run's dataset, an older one without a digest of the source if any."""
-    older = out / f"demos-{digest({k: v for k, v in description.items() if k != 'source'})}"
-    return older if older.exists() else out / f"demos-{digest(description)}"
+    """Returns the folder of a run's dataset."""
+    return out / f"demos-{digest(description)}"
 
 
 def create(root: Path, description: Mapping[str, Any]) -> None:
@@ -59,6 +58,7 @@ def create(root: Path, description: Mapping[str, Any]) -> None:
 
     Raises:
       StorageError: `root` holds another dataset, or an unfinished one of other software versions.
+      UsageError: a part's code is another under an equal version.
     """
     description = json.loads(json.dumps(description))
     path = root / "dataset.json"
@@ -70,10 +70,8 @@ def create(root: Path, description: Mapping[str, Any]) -> None:
     present = read_description(root)
     names = {**description, **present}
     differing = [k for k in names if description.get(k) != present.get(k)]
-    if not ("source" in description and "source" in present):  # older datasets lack it
-        differing = [k for k in differing if k != "source"]
-    if is_sealed(root):
-        differing = [k for k in differing if k != "versions"]
+    ignored = {"source", "versions"} if is_sealed(root) else {"source"}
+    differing = [k for k in differing if k not in ignored]
     if differing:
         name = differing[0]
         incomplete = "an incomplete dataset of other software"
@@ -82,6 +80,7 @@ def create(root: Path, description: Mapping[str, Any]) -> None:
             f"{root} holds {kind}: its {name} is {present.get(name)}, not "
             f"{description.get(name)}; choose another folder, or remove this one"
         )
+    sources.refuse_other_code(path, present, description)
 
 
 def read_description(root: Path) -> dict[str, Any]:

@@ -36,8 +36,8 @@ class LocalConnection:
                 **{key: list(getattr(policy, key)) for key in ("arms", "tools", "cameras")},
             },
             **({"execute": policy.execute} if policy.execute else {}),
-            "packages": sources.versions(POLICIES.path(name)),
-            "source": sources.digests(POLICIES.path(name)),
+            "packages": sources.packages([sources.identity(POLICIES, name)]),
+            **sources.record([sources.identity(POLICIES, name)]),
         }
 
     def widen(self, count: int) -> None:

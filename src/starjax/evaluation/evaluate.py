@@ -24,6 +24,7 @@ from starjax import errors
 from starjax.data import schema
 from starjax.evaluation import alarms, recorded
 from starjax.evaluation import trials as tables
+from starjax.evaluation.disturbances import DISTURBANCES
 from starjax.monitor.scores import NAMES, ScoreSettings
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import chunks, engine, episodes, plans, sharing, workers
@@ -115,7 +116,12 @@ def evaluate(
             "scene": env.names._asdict(),
             "model": schema.model_hash(env.scene),
             "platform": device.platform,
-            "source": sources.digests(*registries.paths(env.names)),
+            **sources.record(
+                [
+                    *registries.parts(env.names),
+                    *(sources.identity(DISTURBANCES, name) for name in wrong),
+                ]
+            ),
             "versions": xla.versions(),
             **jax_settings.record(),
         }
@@ -220,8 +226,9 @@ def _resume(
         previous = {}
     before = [previous.pop(name, 0) for name in sizes]
     fits = 1 <= before[0] <= max_lanes and 1 <= before[1] <= before[0] * several
-    previous.setdefault("source", plan["source"])  # older evaluations lack it
-    if fits and previous == json.loads(json.dumps(plan)):
+    now = json.loads(json.dumps(plan))
+    if fits and {**previous, "source": {}} == {**now, "source": {}}:
+        sources.refuse_other_code(path, previous, now)
         return before
     old = len(list(directory.glob("chunk_*.npz")))
     if old:

@@ -99,8 +99,8 @@ def write(
         **figures,
         **about,
         **provenance.code()._asdict(),
-        "source": sources.digests(*parts),
-        "versions": {**xla.versions(), **sources.versions(*parts)},
+        **sources.record(parts),
+        "versions": {**xla.versions(), **sources.packages(parts)},
         "hardware": xla.hardware(),
         **jax_settings.record(),
     }
@@ -110,8 +110,8 @@ def write(
     return result
 
 
-def parts_of(scene: names.SceneNames, settings: Mapping[str, Any]) -> list[str]:
-    """Returns the `module:object` of each part that a result depends on, for `runtime.sources`.
+def parts_of(scene: names.SceneNames, settings: Mapping[str, Any]) -> list[sources.Identity]:
+    """Returns the identity of each part that a result depends on.
 
     Args:
       settings: of the run, JSON values as far as known.
@@ -119,7 +119,7 @@ def parts_of(scene: names.SceneNames, settings: Mapping[str, Any]) -> list[str]:
     policy = settings.get("policy", {})
     names = ("learner", "encoder", "depth_encoder")
     of_policy = [policy.get(name, "") for name in names]
-    return [*registries.paths(scene), *learners.parts(settings.get("method", ""), *of_policy)]
+    return [*registries.parts(scene), *learners.parts(settings.get("method", ""), *of_policy)]
 
 
 def _parse(file: Path, values: dict[str, Any], kind: type[Evaluation] | type[Sweep]) -> Result:

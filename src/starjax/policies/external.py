@@ -25,6 +25,7 @@ class ExternalPolicy(NamedTuple):
       image_size: pixels per side.
       arms, tools, cameras: names; empty for the task's defaults.
       execute: commands executed before the next plan; 0 for all.
+      version: raised with a change of its commands.
     """
 
     description: str
@@ -36,6 +37,7 @@ class ExternalPolicy(NamedTuple):
     tools: tuple[str, ...] = ()
     cameras: tuple[str, ...] = ()
     execute: int = 0
+    version: int = 1
 
 
 POLICIES = Registry("policy", {}, "starjax.policies.external:ExternalPolicy")

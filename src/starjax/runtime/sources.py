@@ -1,6 +1,9 @@
-"""Digests of the Python code that a part consists of, and the packages that provide it.
+"""Identity of a part: its version, and the digest of its code, in case that is forgotten.
 
-An edited task or expert makes its demonstrations and results stale, as an edited MJCF does.
+A task, expert, arm, tool, disturbance or learner has a `version`, which datasets and results are
+found by. The digest of its code is recorded with it: other code under an equal version is refused.
+Imports, docstrings, comments and the places of files do not count. Each digest in a row of
+`accepted.json` stands for the row's first: code that was rewritten and gives the same numbers.
 """
 
 import ast
@@ -8,53 +11,77 @@ import functools
 import hashlib
 import importlib.metadata
 import importlib.util
-import io
-import tokenize
-from collections.abc import Iterable, Iterator
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+from starjax import errors
+
+ACCEPTED = Path(__file__).with_name("accepted.json")
 _OURS = "starjax"
-# Of starjax, the modules of tasks alone: an edit of another module leaves demonstrations valid.
-_TASKS = ("starjax.sim.tasks.", "starjax.addons.")
-_SHARED = frozenset({"starjax.sim.tasks.base"})  # the interface
-_DIGITS = 16
-_SKIPPED = (tokenize.COMMENT, tokenize.NL)
-_STATEMENT_ENDS = (tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
-# A string with expressions is several tokens from Python 3.12 on, one before.
-_STRING_STARTS, _STRING_ENDS = (
-    tuple(getattr(tokenize, f"{kind}STRING_{end}", None) for kind in "FT")
-    for end in ("START", "END")
+# Of starjax, a part's code is that of its modules in these packages, without the interfaces.
+_PARTS = (
+    *("starjax.sim.tasks.", "starjax.sim.arms.", "starjax.sim.tools.", "starjax.addons."),
+    *("starjax.evaluation.disturbances.", "starjax.policies.learners."),
 )
+_DIGITS = 16
 
 
-def digests(*parts: Any) -> dict[str, str]:
-    """Returns the digest of the code of each package that provides the parts.
+class Identity(NamedTuple):
+    """Identity of a part.
+
+    Attributes:
+      name: kind and name, e.g. `task reach`.
+      version: of its record.
+      code: `module:object`, or a function; empty for data and unknown parts.
+    """
+
+    name: str
+    version: int
+    code: str | Callable
+
+
+def identity(registry: Any, name: str) -> Identity:
+    """Returns the identity of a part of a `registry.Registry`; records without a version have 1."""
+    path = registry.path(name)
+    version = getattr(path and registry.get(name), "version", 1)
+    return Identity(f"{registry.kind} {name}", version, path)
+
+
+def record(parts: Iterable[Identity]) -> dict[str, Any]:
+    """Returns versions and digests of parts, for files.
+
+    Returns:
+      {"parts": name -> version, "source": name -> digest of the parts with code to compare}.
+    """
+    known = [part for part in parts if part.code]
+    digests = {part.name: _digest_of(part) for part in known}
+    return {
+        "parts": {part.name: part.version for part in known},
+        "source": {name: digest for name, digest in digests.items() if digest},
+    }
+
+
+def refuse_other_code(where: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Raises UsageError for a part whose code has changed under an equal version.
 
     Args:
-      parts: functions, or names of objects as `module:object`.
-
-    A package's digest covers its version and all its modules; starjax's covers the modules of the
-    task and those of tasks that these import. Comments and docstrings do not count.
+      where: file of `before`.
+      before, now: contents with the values of `record`; older ones lack them.
     """
-    by_package: dict[str, set[str]] = {}
-    for module in _modules(parts):
-        by_package.setdefault(module.partition(".")[0], set()).add(module)
-    found = {}
-    for package, modules in sorted(by_package.items()):
-        if package != _OURS:
-            files = _files_of(package)
-        else:
-            tasks = _closure(name for name in modules if name.startswith(_TASKS))
-            files = tuple(filter(None, map(_file, sorted(tasks))))
-        if files:
-            found[package] = digest(version(package) if package != _OURS else "", files)
-    return found
+    for name, digest in now["source"].items():
+        known = before.get("source", {}).get(name, digest)
+        version = before.get("parts", {}).get(name)
+        if known != digest and version == now["parts"][name]:
+            got = f"other code of version {version}"
+            raise errors.UsageError(name, f"that of {where}", got, f"raise the version of {name}")
 
 
-def versions(*parts: Any) -> dict[str, str]:
-    """Returns the versions of the packages other than starjax that provide the parts."""
-    return {name: version(name) for name in digests(*parts) if name != _OURS}
+def packages(parts: Iterable[Identity]) -> dict[str, str]:
+    """Returns the versions of the packages other than starjax that provide parts."""
+    names = {_module(part).partition(".")[0] for part in parts} - {_OURS, ""}
+    return {name: version(name) for name in sorted(names)}
 
 
 def version(package: str) -> str:
@@ -63,25 +90,44 @@ def version(package: str) -> str:
     return importlib.metadata.version(owners[0]) if owners else ""
 
 
-def _modules(parts: Iterable[Any]) -> set[str]:
-    """Returns the modules that define objects."""
-    modules = (
-        part.partition(":")[0] if isinstance(part, str) else getattr(part, "__module__", "")
-        for part in parts
-    )
-    return set(filter(None, modules)) - _SHARED
+def digest(files: Iterable[Path]) -> str:
+    """Returns the digest of the code in files."""
+    code = sorted(_code(path.read_bytes()) for path in files)
+    return hashlib.sha256("\n".join(code).encode()).hexdigest()[:_DIGITS]
 
 
-def _closure(modules: Iterable[str]) -> set[str]:
-    """Returns modules of tasks with those of tasks that they import."""
-    found, waiting = set(), list(modules)
+def _digest_of(part: Identity) -> str:
+    """Returns the digest of a part's code, or the one that it is accepted for."""
+    module = _module(part)
+    package = module.partition(".")[0]
+    files = _modules(module) if package == _OURS else _files_of(package)
+    found = digest(files) if files else ""
+    row = _accepted().get(part.name, [0])
+    return row[1] if [part.version] == row[:1] and found in row else found
+
+
+@functools.cache
+def _accepted() -> dict[str, list]:
+    """Returns the parts of starjax: name -> version and digests of equal meaning."""
+    return json.loads(ACCEPTED.read_text())
+
+
+def _module(part: Identity) -> str:
+    code = part.code
+    return code.partition(":")[0] if isinstance(code, str) else getattr(code, "__module__", "")
+
+
+def _modules(name: str) -> tuple[Path, ...]:
+    """Returns the files of a module of parts and of those that it imports."""
+    found, waiting = {}, [name]
     while waiting:
         name = waiting.pop()
-        path = _file(name)
-        if name not in found and path is not None:
-            found.add(name)
-            waiting += [x for x in _imports(path) if x.startswith(_TASKS) and x not in _SHARED]
-    return found
+        is_part = name.startswith(_PARTS) and not name.endswith(".base")
+        path = _file(name) if is_part and name not in found else None
+        if path is not None:
+            found[name] = path
+            waiting += _imports(path)
+    return tuple(found.values())
 
 
 def _imports(path: Path) -> Iterator[str]:
@@ -108,59 +154,31 @@ def _files_of(package: str) -> tuple[Path, ...]:
     path = _file(package)
     if path is None:
         return ()
-    return tuple(sorted(path.parent.rglob("*.py"))) if path.name == "__init__.py" else (path,)
-
-
-def digest(prefix: str, files: Iterable[Path]) -> str:
-    """Returns the digest of a text and of the code in files, without comments and docstrings."""
-    total = hashlib.sha256(prefix.encode())
-    for path in files:
-        total.update(f"\n{path.name}\n{_code(path.read_bytes())}".encode())
-    return total.hexdigest()[:_DIGITS]
+    return tuple(path.parent.rglob("*.py")) if path.name == "__init__.py" else (path,)
 
 
 @functools.lru_cache(maxsize=1024)
 def _code(content: bytes) -> str:
-    """Returns the tokens of a module without comments and docstrings."""
+    """Returns the syntax tree of a module as text, the same in every version of Python."""
     try:
-        tokens = [token for token in _tokens(content) if token.type not in _SKIPPED]
-    except (tokenize.TokenError, SyntaxError):
+        return _text(ast.parse(content))
+    except (SyntaxError, ValueError):
         return content.decode(errors="replace")
-    kept, is_docstring = [], False
-    for i, token in enumerate(tokens):
-        if is_docstring:  # its line end
-            is_docstring = False
-            continue
-        begins = i == 0 or tokens[i - 1].type in _STATEMENT_ENDS
-        ends = i + 1 < len(tokens) and tokens[i + 1].type in (tokenize.NEWLINE, tokenize.ENDMARKER)
-        is_docstring = token.type == tokenize.STRING and begins and ends
-        if not is_docstring:
-            # An indentation's string is its blanks, which do not count.
-            kept.append(token.string.strip() or tokenize.tok_name[token.type])
-    return " ".join(kept)
 
 
-def _tokens(content: bytes) -> Iterator[tokenize.TokenInfo]:
-    """Yields the tokens of a module, every string as one, in any version of Python and line end."""
-    encoding, _ = tokenize.detect_encoding(io.BytesIO(content).readline)
-    lines = list(io.StringIO(content.decode(encoding), newline=None))
-    depth, start = 0, (1, 0)
-    for token in tokenize.generate_tokens(iter(lines).__next__):
-        if token.type in _STRING_STARTS:
-            start = start if depth else token.start
-            depth += 1
-        elif token.type in _STRING_ENDS:
-            depth -= 1
-            token = token._replace(
-                type=tokenize.STRING, string=_between(lines, start, token.end), start=start
-            )
-        if not depth:
-            yield token
+def _text(node: Any) -> str:
+    """Returns a syntax tree as text, without imports, docstrings and empty fields."""
+    if isinstance(node, list):
+        texts = [_text(item) for item in node if not _is_aside(item)]
+        return f"[{', '.join(texts)}]" if texts else ""
+    if not isinstance(node, ast.AST):
+        return "" if node is None else repr(node)
+    if isinstance(node, ast.JoinedStr):  # Python 3.12 ends some by an empty text
+        node.values = [value for value in node.values if getattr(value, "value", None) != ""]
+    fields = [f"{name}={text}" for name, value in ast.iter_fields(node) if (text := _text(value))]
+    return f"{type(node).__name__}({', '.join(fields)})"
 
 
-def _between(lines: list[str], start: tuple[int, int], end: tuple[int, int]) -> str:
-    """Returns the text between two positions: row, from 1, and column."""
-    part = lines[start[0] - 1 : end[0]]
-    part[-1] = part[-1][: end[1]]
-    part[0] = part[0][start[1] :]
-    return "".join(part)
+def _is_aside(node: Any) -> bool:
+    is_text = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    return is_text or isinstance(node, ast.Import | ast.ImportFrom)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from starjax import extensions
 from starjax.registry import Registry, entries
+from starjax.runtime import sources
 from starjax.sim.arms.base import Arm, Mount
 from starjax.sim.names import SceneNames
 
@@ -75,13 +76,10 @@ def rescuer_name(task: "Task", expert: str) -> str:
     return task.name if is_first else f"{task.name}.{expert}"
 
 
-def paths(names: SceneNames) -> list[str]:
-    """Returns the `module:object` of each part of a scene, empty for unknown names."""
-    return [
-        tasks.path(names.task),
-        *(arms.path(name) for name in names.arms),
-        *(tools.path(name) for name in names.tools),
-    ]
+def parts(names: SceneNames) -> list[sources.Identity]:
+    """Returns the identity of each part of a scene."""
+    kinds = ((tasks, (names.task,)), (arms, names.arms), (tools, names.tools))
+    return [sources.identity(kind, name) for kind, of in kinds for name in of]
 
 
 def mount(arm: Arm, tool: str, workspace: str) -> Mount | None:

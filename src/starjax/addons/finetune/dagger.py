@@ -16,6 +16,7 @@ from starjax import config, errors
 from starjax.addons.finetune.rounds import LearnedEpisode, Way
 from starjax.rollouts import episodes, progress, takeover
 from starjax.rollouts.agent import BatchAgent
+from starjax.runtime import sources
 from starjax.sim import registries, wrists
 from starjax.sim.tasks.base import Task
 
@@ -94,7 +95,7 @@ def way(
         record=takeover.RECORDS[settings.observation],
         choose=choose,
         cause=lambda found: cause(found[0]),
-        modules=(registries.rescuers.path(name),),
+        parts=(sources.identity(registries.rescuers, name),),
         again=lambda found: earlier(found[0], control_hz),
     )
 

@@ -59,7 +59,7 @@ class Way(NamedTuple):
       record: of the trials.
       choose: episodes of a trial, one per run -> the one that is learned, or None.
       cause: the same -> a word that the outcomes count.
-      modules: `module:object` of the code that decides it, for the description.
+      parts: identities of the code that decides it, for the description.
     """
 
     source: str
@@ -69,7 +69,7 @@ class Way(NamedTuple):
     record: episodes.Record
     choose: Callable[[Sequence[episodes.Episode]], LearnedEpisode | None]
     cause: Callable[[Sequence[episodes.Episode]], str]
-    modules: tuple[str, ...] = ()
+    parts: tuple[sources.Identity, ...] = ()
     again: Callable[[Sequence[episodes.Episode]], Sequence[int]] = lambda found: ()
 
 
@@ -122,9 +122,10 @@ def describe(env: Any, trocars: Trocar, way: Way, settings: RoundSettings) -> di
     )
     description = schema.describe(recorded, trocars, plain)
     stream = STREAM + settings.number
+    added = sources.record(way.parts)
     return {
         **takeover.with_actor(description, way.source, settings.policy),
-        "source": {**description["source"], **sources.digests(*way.modules)},
+        **{name: {**description[name], **values} for name, values in added.items()},
         "stream": stream,
         "seed_rule": schema.seed_rule(stream),
         **settings.about,

@@ -59,6 +59,7 @@ class Disturbance(NamedTuple):
       stores_states: the memory holds states, so other disturbances must act first.
       for_demos: demonstrations that are recorded with it teach a policy to withstand it.
       wrist_only: tools without a wrist never meet it.
+      version: raised with a change of its effect at a level.
     """
 
     description: str
@@ -85,6 +86,7 @@ class Disturbance(NamedTuple):
     stores_states: bool = False
     for_demos: bool = True
     wrist_only: bool = False
+    version: int = 1
 
     @property
     def image_only(self) -> bool:

@@ -52,6 +52,7 @@ class Arm(NamedTuple):
         kinematics; 0 for up to six joints.
       link_radius: m, of its links, for the collision watch.
       watched: the first joint whose origin must stay above the table.
+      version: raised with a change that moves it otherwise, such as of a mount.
       remote_centre: True for a mechanical remote centre, whose base stands at the trocar.
     """
 
@@ -66,3 +67,4 @@ class Arm(NamedTuple):
     link_radius: float = 0.05
     watched: int = 2
     remote_centre: bool = False
+    version: int = 1

@@ -237,6 +237,8 @@ class Task(NamedTuple):
       thread: (Measurements) -> `[N, 3]` m, points of a thread, whose links are the MJCF's geoms
         `thread0`, ..; or None. See `addons.suture.thread`.
       coupling: forces of the task's own, or None.
+      version: raised with a change of its starts, observation or judge; experts' results are found
+        by `expert_version` too, which is raised with a change of any of its experts.
       endoscope: ranges of the camera `endoscope` in a trocar of its own, or None if `cameras` has
         no such one or a tool carries it.
     """
@@ -276,6 +278,8 @@ class Task(NamedTuple):
     thread: Callable[..., jax.Array] | None = None
     coupling: Coupling | None = None
     endoscope: Endoscope | None = None
+    version: int = 1
+    expert_version: int = 1
 
     @property
     def arms(self) -> int:

@@ -25,11 +25,13 @@ class Rescuer(NamedTuple):
       resume: (key, EnvState) -> memory. At reset it acts like the expert.
       act: as `Agent.act`, of the expert.
       nearly_lost: EnvState -> bool, True if the task will soon be lost unless something changes.
+      version: raised with a change of its motions.
     """
 
     resume: Callable[[jax.Array, EnvState], Any]
     act: Callable[..., Any]
     nearly_lost: Callable[[EnvState], jax.Array] = _never
+    version: int = 1
 
 
 class Entry(NamedTuple):

@@ -28,6 +28,7 @@ class Tool(NamedTuple):
       wrist_joints: names of pitch and yaw, each with a servo of its name.
       wrist_speed: rad/s of each, at most.
       palm_radius: m, of everything from the pitch axis to the jaws.
+      version: raised with a change that makes it grasp or move otherwise.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Tool(NamedTuple):
     wrist_joints: tuple[str, ...] = ()
     wrist_speed: float = 0.0
     palm_radius: float = 0.0
+    version: int = 1
 
     @property
     def base(self) -> str:

@@ -272,6 +272,7 @@ def make(
         ),
         stages=STAGES,
         text=text.TEXT,
+        expert_version=2,
         experts=experts,
         graspable=(),
         bind=lambda m: bind(size, m),

@@ -217,6 +217,7 @@ TASK = Task(
     fields=pick.TASK.fields,
     stages=STAGES,
     text=text.TEXT,
+    expert_version=2,
     experts={"default": "starjax.addons.suture.needle_regrasp.expert:AGENT"},
     graspable=pick.TASK.graspable,
     bind=bind,

@@ -220,6 +220,7 @@ TASK = driven.TASK._replace(
     fields=(*driven.TASK.fields, Field("through", 1, "unit"), Field("pulled", 1, "unit")),
     stages=STAGES,
     text=text.TEXT,
+    expert_version=2,
     experts={"default": "starjax.addons.suture.suture_throw.expert:AGENT"},
     bind=partial(driven.bind, SIZE),
     sample=sample,

@@ -260,6 +260,7 @@ TASK = Task(
     fields=(Field("target.p", 3, "point"),),
     stages=STAGES,
     text=text.TEXT,
+    expert_version=2,
     experts={"default": "starjax.sim.tasks.endoscope_track.expert:AGENT"},
     graspable=(),
     bind=bind,

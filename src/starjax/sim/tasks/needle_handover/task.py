@@ -136,6 +136,7 @@ TASK = single.TASK._replace(
     time_limit_s=60.0,
     stages=STAGES,
     text=text.TEXT,
+    expert_version=2,
     experts={
         "default": "starjax.sim.tasks.needle_handover.expert:AGENT",
         "wrist": "starjax.sim.tasks.needle_handover.expert_wrist:AGENT",

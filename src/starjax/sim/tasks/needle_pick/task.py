@@ -201,6 +201,7 @@ TASK = Task(
     fields=(Field("needle.p", 3, "point"), Field("needle.R", 6, "rot6d")),
     stages=STAGES,
     text=text.TEXT,
+    expert_version=2,
     experts={"default": "starjax.sim.tasks.needle_pick.expert:AGENT"},
     graspable=tuple(f"wire{k}{side}" for k in range(SEGMENTS) for side in "ab"),
     bind=bind,

@@ -269,6 +269,7 @@ TASK = Task(
     labels=("source", "target"),
     stages=STAGES,
     text=text.TEXT,
+    expert_version=2,
     experts={
         "default": "starjax.sim.tasks.peg_transfer.expert:AGENT",
         "one_wall": "starjax.sim.tasks.peg_transfer.expert:WITH_ONE_WALL",

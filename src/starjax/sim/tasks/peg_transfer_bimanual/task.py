@@ -128,6 +128,7 @@ TASK = single.TASK._replace(
     cameras=("side", endoscope_camera.NAME),
     stages=STAGES,
     text=text.TEXT,
+    expert_version=2,
     experts={"default": "starjax.sim.tasks.peg_transfer_bimanual.expert:AGENT"},
     sample=sample,
     tips=lambda bound, layout, p_trocars: layout.tips,

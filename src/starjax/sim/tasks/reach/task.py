@@ -122,6 +122,7 @@ TASK = Task(
     labels=("goal",),
     stages=STAGES,
     text=text.TEXT,
+    expert_version=2,
     experts={"default": "starjax.sim.tasks.reach.expert:AGENT"},
     graspable=(),
     bind=bind,

@@ -240,6 +240,7 @@ TASK = Task(
     labels=("start",),
     stages=STAGES,
     text=text.TEXT,
+    expert_version=2,
     experts={"default": "starjax.sim.tasks.ring_on_wire.expert:AGENT"},
     graspable=("tab0", "tab1"),
     bind=bind,
