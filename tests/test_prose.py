@@ -21,10 +21,18 @@ PAGES = [
     for path in (
         ROOT / "README.md",
         ROOT / "CONTRIBUTING.md",
+        ROOT / "CHANGELOG.md",
         *sorted((ROOT / "docs").rglob("*.md")),
     )
     if "api" not in path.parts
 ]
+# Code and pages beside the package.
+BESIDE = {
+    name: [
+        path for kind in ("py", "md", "toml") for path in sorted((ROOT / name).rglob(f"*.{kind}"))
+    ]
+    for name in ("tests", "benchmarks", "experiments")
+}
 FIRST_WORDS = re.compile(r"^(What|Which|Whether|How|Where|When|Why|Who(ever)?)\b")
 
 PATTERNS = {
@@ -103,6 +111,30 @@ BUDGETS = {
     "LEFT_OUT": (12, 1),
     "ARTICLE": (0, 0),
 }
+# Highest counts in tests, benchmarks and experiments.
+BESIDE_BUDGETS = {
+    "ATTR": (24, 6, 0),
+    "WHAT": (112, 42, 1),
+    "NONE": (5, 2, 0),
+    "THERE": (8, 0, 0),
+    "IDIOM": (27, 1, 0),
+    "GO_ON": (2, 1, 0),
+    "BESIDE": (21, 19, 0),
+    "SPLICE": (0, 0, 0),
+    "INVERTED": (15, 7, 0),
+    "ANTHRO": (38, 6, 1),
+    "SO_THAT": (15, 8, 0),
+    "EACH": (1, 5, 1),
+    "PER": (1, 13, 0),
+    "IS_TO": (1, 0, 0),
+    "WHERE": (19, 4, 0),
+    "LEFT_OUT": (7, 3, 1),
+    "ARTICLE": (1, 4, 3),
+}
+# Highest numbers of comments that begin with "of" in src, tests, benchmarks and experiments.
+OF = (0, 50, 24, 0)
+# Most bullets of a version in the changelog, and words of a bullet.
+BULLETS, WORDS = 60, 25
 # Highest numbers of first docstring lines that begin with a question word, of functions without a
 # verb in front, and of names that several classes share.
 OPEN, VERBLESS, HOMONYMS = 0, 0, 0
@@ -140,6 +172,13 @@ def lines_of_source(path: pathlib.Path) -> list[tuple[str, str]]:
         ):
             lines.append(("comment", token.string.lstrip("# ")))
     return lines
+
+
+def lines_of(path: pathlib.Path) -> list[str]:
+    """Lines of prose of a module, a page or a claim."""
+    if path.suffix == ".py":
+        return [line for _, line in lines_of_source(path)]
+    return lines_of_page(path)
 
 
 @functools.cache
@@ -193,6 +232,38 @@ def test_expressions_stay_within_their_budget(name):
     pattern = COMPILED[name]
     found = [sum(len(pattern.findall(line)) for line in lines) for lines in (in_source, in_pages)]
     assert all(x <= most for x, most in zip(found, BUDGETS[name], strict=True)), found
+
+
+@pytest.mark.parametrize("name", PATTERNS)
+def test_expressions_beside_the_package_stay_within_their_budget(name):
+    found = tuple(
+        sum(len(COMPILED[name].findall(line)) for path in paths for line in lines_of(path))
+        for paths in BESIDE.values()
+    )
+    assert all(x <= most for x, most in zip(found, BESIDE_BUDGETS[name], strict=True)), found
+
+
+def test_comments_begin_with_a_noun_or_a_verb():
+    found = tuple(
+        sum(
+            kind == "comment" and line[:3].lower() == "of "
+            for path in paths
+            if path.suffix == ".py"
+            for kind, line in lines_of_source(path)
+        )
+        for paths in (SOURCE, *BESIDE.values())
+    )
+    assert all(x <= most for x, most in zip(found, OF, strict=True)), found
+
+
+def test_the_changelog_is_short():
+    versions = re.split(r"^## ", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)[1:]
+    for version in versions:
+        bullets = re.findall(r"^- (.*(?:\n  .*)*)", version, re.MULTILINE)
+        assert 0 < len(bullets) <= BULLETS, version[:10]
+        for bullet in bullets:
+            words = re.sub(r"\]\([^)]*\)", "]", bullet).split()
+            assert len(words) <= WORDS, bullet
 
 
 def test_no_docstring_begins_with_a_question_word():

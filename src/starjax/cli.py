@@ -78,7 +78,7 @@ _WRITING = (errno.ENOSPC, errno.EROFS, errno.EDQUOT)
 _STORAGE = (
     *_WRITING, errno.EACCES, errno.EPERM, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG
 )  # fmt: skip
-_NAME_WIDTH = 11  # of subcommands in the help
+_NAME_WIDTH = 11  # for subcommands in the help
 _STOPPED = 130  # exit code after a stop, see `signals`
 _BROKEN_PIPE = 141  # exit code if the output pipe is closed (128 + SIGPIPE), as by `| head`
 _OURS = os.path.join(os.path.dirname(os.path.abspath(__file__)), "")

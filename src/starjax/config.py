@@ -121,8 +121,8 @@ class TrainConfig:
     # image augmentation: brightness, contrast and saturation times 1 +- this
     jitter: NotNegative = 0.1
     image_noise: NotNegative = 0.02  # standard deviation of the noise on images in [0, 1]
-    # disturbances of images, cameras and observations, NAME=MAX_LEVEL as in starjax stress; in half
-    # of the samples each is on with probability one half, at a uniform level
+    # disturbances of images, cameras and observations, NAME=MAX_LEVEL as in starjax stress; half
+    # the samples have each with probability one half, at a uniform level
     randomise: tuple[str, ...] = ()
     # standard deviation of the noise on normalised poses and task state
     state_noise: NotNegative = 0.02

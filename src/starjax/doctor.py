@@ -20,7 +20,7 @@ The exit code is 1 if there is a fault.
 Examples:
   starjax doctor"""
 NEEDED_MEMORY = 4e9  # bytes free for the preset `cpu`
-NEEDED_DISK = 3e9  # of a run of the preset `cpu`: 2.4 GB
+NEEDED_DISK = 3e9  # for a run of the preset `cpu`: 2.4 GB
 
 
 class Finding(NamedTuple):

@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Iterable
 from typing import Any
 
-_LETTERS = 2  # of a word that can stand for those that contain it
+_LETTERS = 2  # for a word that can stand for those that contain it
 _SUGGESTIONS = 3  # at most
 
 
@@ -20,7 +20,7 @@ class UsageError(ValueError):
     """
 
     def __init__(self, argument: str, expected: str, got: Any, hint: str = "") -> None:
-        got = got.got if isinstance(got, UsageError) else got  # of the part that found it
+        got = got.got if isinstance(got, UsageError) else got  # that of the inner error
         self.argument, self.expected, self.got, self.hint = argument, expected, got, hint
         ending = f"; {hint}" if hint else ""
         super().__init__(f"{argument}: expected {expected}, got {got}{ending}")

@@ -18,7 +18,7 @@ Examples:
   starjax bench runs/cpu/stardiff
   starjax bench --policy compact --ddim-steps 5 10 100"""
 
-DDIM_STEPS = (1, 2, 5, 10, 20, 50, 100)  # of Table IV
+DDIM_STEPS = (1, 2, 5, 10, 20, 50, 100)  # steps of Table IV
 
 
 @dataclasses.dataclass(frozen=True)

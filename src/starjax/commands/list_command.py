@@ -77,7 +77,7 @@ def described(registry: Registry, describe: Callable[[Any], str]) -> Iterator[Ro
     for name in registry.names():
         try:
             yield name, describe(registry.get(name))
-        except errors.UsageError as error:  # of a package that cannot be used
+        except errors.UsageError as error:  # from a package that cannot be used
             yield name, f"cannot be used: {error.got}"
         except Exception as error:
             yield name, f"cannot be used: {registry.path(name)}: {type(error).__name__}: {error}"

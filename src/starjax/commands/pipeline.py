@@ -299,7 +299,7 @@ def _report(out: Path, names: Sequence[str]) -> None:
     with stage_times.timed(out, "report"):
         try:
             page = build.build(scored, out / "report", report=messages.indented)
-        except ValueError as error:  # of a damaged file, which it names
+        except ValueError as error:  # from a damaged file, which it names
             raise errors.UsageError(str(out), "complete results", error) from error
     results = [result.read(out / name / "result.json") for name in names]
     print(f"\n{messages.outcome(results)}\n\nreport: {page}", flush=True)

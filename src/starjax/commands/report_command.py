@@ -53,7 +53,7 @@ def main(argv: Sequence[str]) -> int:
 
     try:
         page = build.build(runs, Path(out), with_video=args.video, against=args.against)
-    except ValueError as error:  # of a damaged file, which it names
+    except ValueError as error:  # from a damaged file, which it names
         if isinstance(error, errors.UsageError):
             raise
         raise errors.UsageError("RUN", "results that are whole", error) from error

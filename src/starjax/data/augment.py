@@ -13,7 +13,7 @@ import numpy as np
 
 from starjax.runtime import hashing
 
-# Of ImageNet, which the pretrained encoder expects; good enough from scratch.
+# Statistics of ImageNet, which the pretrained encoder expects; good enough from scratch.
 MEAN = (0.485, 0.456, 0.406)
 STD = (0.229, 0.224, 0.225)
 LUMINANCE = (0.299, 0.587, 0.114)

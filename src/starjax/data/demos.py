@@ -33,7 +33,7 @@ from starjax.runtime import files, progress, xla
 
 COMMITS = 16  # threads that write episodes; they mostly wait for the disk
 FRAME_GUESS = 300  # control steps of a typical demonstration, for estimates of disk and memory
-MEMORY_SHARE = 0.25  # of the host's, for images of the episodes that are simulated together
+MEMORY_SHARE = 0.25  # part of the host's, for images of the episodes that are simulated together
 GPU_LANES = 256  # episodes a GPU simulates together
 
 

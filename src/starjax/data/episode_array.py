@@ -18,7 +18,7 @@ import numpy as np
 
 _MOST_OPEN = 256  # files of a field at once; systems allow a process about 1,000
 _THREADS = 16  # reads at once; they mostly wait for the disk
-_ROWS = 8  # of a thread's share at least
+_ROWS = 8  # for a thread's share at least
 _HEADERS = threading.Lock()
 
 

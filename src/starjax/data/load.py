@@ -18,8 +18,8 @@ from starjax.types import Command, Observation, Pose
 
 Residency = Literal["auto", "device", "host", "disk"]
 
-DEVICE_SHARE = 0.5  # of the device's free memory that demonstrations may take
-HOST_SHARE = 0.6  # of the host's
+DEVICE_SHARE = 0.5  # part of the device's free memory that demonstrations may take
+HOST_SHARE = 0.6  # part of the host's
 
 
 class Demos(NamedTuple):

@@ -26,7 +26,7 @@ from starjax.sim.tasks.base import Field, Task
 _SMALLEST_RANGE = 1e-4  # m or rad: below it an entry counts as constant, and is only centred
 # Action spaces whose positions are the world's, at every trocar.
 _ABSOLUTE = ("se3", "rcm4", *methods.WRIST_SPACES)
-_EDGE_AZIMUTHS = 16  # of trocars on the edge of Eq. 19: between two of them up to 1 mm is missing
+_EDGE_AZIMUTHS = 16  # for trocars on the edge of Eq. 19: between two of them up to 1 mm is missing
 
 
 @flax.struct.dataclass

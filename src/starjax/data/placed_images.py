@@ -10,7 +10,7 @@ import numpy as np
 from starjax.data import redraw
 from starjax.data.episode_array import EpisodeArray
 
-Images = EpisodeArray | redraw.DrawnImages  # of one dataset and camera
+Images = EpisodeArray | redraw.DrawnImages  # for one dataset and camera
 
 
 class JoinedImages:

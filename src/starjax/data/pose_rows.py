@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from starjax.errors import UsageError
 
-COLUMNS = 8  # of an arm
+COLUMNS = 8  # for an arm
 ACTIONS = ("pose", "rcm4")  # columns of the actions
 _SHORTEST = 0.5  # norm of a quaternion: below, its direction is noise
 

@@ -10,10 +10,10 @@ import numpy as np
 from starjax.data import schema, shafts, store
 from starjax.rcm.trocar import trocar_position
 
-MAX_EPISODES = 50  # of a dataset whose motions are read
+MAX_EPISODES = 50  # for a dataset whose motions are read
 _WINDOW_S = 5.0  # s, of the motion by which a trocar's wander is estimated
-_MAX_WINDOWS = 6  # of an episode, evenly spaced
-_CLOSED = 0.0  # of a gripper in [-1, 1], below which it counts as closed
+_MAX_WINDOWS = 6  # for an episode, evenly spaced
+_CLOSED = 0.0  # for a gripper in [-1, 1], below which it counts as closed
 
 
 class EpisodeMotion(NamedTuple):

@@ -20,7 +20,7 @@ TIP, AXIS, JAW = 5e-5, float(np.deg2rad(0.05)), 0.005  # m, rad and opening that
 MOST = 4  # control steps that an expert stands still, before the task's judge begins to settle
 RARELY = 0.01  # share of successes that may stand still longer, after a miss
 LONG = 7  # control steps
-PART = 1e-3  # of its range in an episode, by which a number of unknown unit moves
+PART = 1e-3  # part of its range in an episode, by which a number of unknown unit moves
 
 
 def is_still(before: Command, after: Command) -> Any:

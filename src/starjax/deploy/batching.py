@@ -51,7 +51,7 @@ class Batches:
                 valid.append(i)
             except UsageError as error:
                 replies[i] = error
-            except ValueError as error:  # of `rcm.check_trocar`
+            except ValueError as error:  # from `rcm.check_trocar`
                 replies[i] = UsageError("trocar", "finite radius >= 0 and angles", str(error))
         if not valid:
             return replies

@@ -22,7 +22,7 @@ from starjax.errors import UsageError
 from starjax.monitor.watch import Watch
 from starjax.types import Command, Pose
 
-TIMEOUT_S = 1.0  # of a reply, and of a connection attempt
+TIMEOUT_S = 1.0  # for a reply, and for a connection attempt
 WAIT_S = 10.0  # for the first connection
 
 

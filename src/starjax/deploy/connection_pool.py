@@ -10,7 +10,7 @@ from websockets.sync import client as sockets
 from starjax.deploy import wire
 from starjax.errors import UsageError
 
-TIMEOUT_S = 120.0  # of an answer: a server may compile at the first request
+TIMEOUT_S = 120.0  # for an answer: a server may compile at the first request
 CONNECT_S = 10.0
 MAX_REPLY = 1 << 24  # bytes
 _SILENT = logging.getLogger("starjax.link")

@@ -22,7 +22,7 @@ from starjax.types import Pose
 
 FARTHEST = 0.5  # m, from the nominal trocar to a trocar or a tip: beyond, the unit is mm
 MAX_BEND = 0.2  # rad beyond the limits of a wrist: the error of a measured trocar is less
-_MAX_OPENING = 1.1  # of a gripper in [-1, 1]: the rest is the sensor's error
+_MAX_OPENING = 1.1  # opening of a gripper in [-1, 1]: the rest is the sensor's error
 _REAL = (jnp.floating, jnp.integer, jnp.bool_)
 
 

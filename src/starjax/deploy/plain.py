@@ -19,7 +19,7 @@ from starjax.sim.tasks.base import Task
 from starjax.types import Command, Pose
 
 MAX_HORIZON = 4096
-_WIDTH = {"pose": pose_rows.COLUMNS, "rcm4": rcm.ACTION_SPACES["rcm4"].dim + 1}  # of an arm
+_WIDTH = {"pose": pose_rows.COLUMNS, "rcm4": rcm.ACTION_SPACES["rcm4"].dim + 1}  # for an arm
 
 
 def input_spec(env: sim_env.Env, settings: config.PolicyConfig) -> InputSpec:

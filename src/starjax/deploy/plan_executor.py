@@ -25,7 +25,7 @@ from starjax.sim.tasks.base import CONTROL_HZ
 from starjax.types import Command, Pose
 
 MAX_OFF = 1e-4  # m, from a plan's axes to the trocar: the networks' plans are off by 1e-8
-MAX_SKEW = 1e-3  # of a plan's matrices from rotations
+MAX_SKEW = 1e-3  # deviation of a plan's matrices from rotations
 _DOWN = np.array([0.0, 0.0, -1.0], np.float32)
 _DEPTH = 0.1  # m, of the tool that the programs are compiled with
 _REMEMBERED = 8  # latest latencies, whose maximum predicts the next

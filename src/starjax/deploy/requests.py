@@ -63,7 +63,7 @@ class History:
         moments = moments[-self._spec.moments :]
         try:
             stacked = {name: np.stack([moment[name] for moment in moments]) for name in shapes}
-        except ValueError:  # of another shape than the moments before
+        except ValueError:  # from another shape than the moments before
             return request, None
         return request | stacked, single
 

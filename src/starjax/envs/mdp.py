@@ -28,7 +28,7 @@ from starjax.envs import ranges, trocar_draws
 from starjax.envs.settings import WRIST_SPACES, EnvSettings
 from starjax.types import Command, Pose
 
-SHARE = 0.1  # of half an action's range, in a control step: of a tip 0.15 m/s, as the arms can
+SHARE = 0.1  # part of half an action's range, in a control step: of a tip 0.15 m/s, as the arms can
 
 
 class Outcome(NamedTuple):

@@ -14,7 +14,7 @@ from starjax.sim.tasks.base import Task
 # the range, and a command past the goal speeds the tool up.
 MARGIN = np.array([0.005, 0.005, 0.015])
 ROLL_MARGIN = 0.2
-AZIMUTHS, ROLLS, TIPS = 16, 9, 3  # of the grid, a side
+AZIMUTHS, ROLLS, TIPS = 16, 9, 3  # sizes of the grid, a side
 
 
 def tips(task: Task) -> tuple[np.ndarray, np.ndarray]:

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple, TypeVar
 
 VERSION = 1
-SEED = 0  # of all trials
+SEED = 0  # seed of all trials
 TROCARS, SEEN = 12, 8  # configurations of a task; the first ones are of the demonstrations
 TRIALS = 50  # at each of a task's configurations
 SWEEP_TROCARS = 200  # other configurations, of Eq. 19 or a task's regions; a trial at each

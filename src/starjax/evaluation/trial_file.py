@@ -78,7 +78,7 @@ def read(file: Path) -> dict[str, Any]:
         beside = file.parent / name
         if beside.parent != file.parent or not beside.is_file():
             raise ValueError(f"{file}: trials: expected a file in its folder, got {name!r}")
-        without = {"labels": {}}  # of a task without labels
+        without = {"labels": {}}  # for a task without labels
         result["trials"] = [without | trial for trial in records(files.read_npz(beside))]
     return result
 

@@ -112,7 +112,7 @@ def _kernel(weight: np.ndarray, like: Any, name: str, path: str | pathlib.Path) 
     expected = (like.shape[3], like.shape[2], like.shape[0], like.shape[1])
     if weight.shape != expected:
         raise errors.UsageError(str(path), f"shape {expected} of {name}", weight.shape)
-    weight = np.asarray(weight, np.float32)  # of float16 and bfloat16 too
+    weight = np.asarray(weight, np.float32)  # also from float16 and bfloat16
     if not np.isfinite(weight).all():
         raise errors.UsageError(str(path), f"finite values in {name}", "others")
     return jnp.asarray(weight.transpose(2, 3, 1, 0), like.dtype)

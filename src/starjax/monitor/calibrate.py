@@ -23,7 +23,7 @@ _FIT, _CALIBRATE = 0.15, 0.425
 _SPREAD = (0.1, 0.9)  # quantiles whose distance is a score's width
 CLOCK_ALPHA = 0.05  # false alarms of the clock that monitors are compared with
 _TINY = 1e-9  # m and s, the least width: against a division by zero
-_ROUNDING = 1e-9  # of a rank: (n + 1)(1 - alpha) may exceed an integer by rounding
+_ROUNDING = 1e-9  # rounding of a rank: (n + 1)(1 - alpha) may exceed an integer by rounding
 
 
 class Monitor(NamedTuple):

@@ -25,8 +25,8 @@ import numpy as np
 NAMES = ("disagreement", "stillness", "clock", "closure", "conflict", "progress")
 CALIBRATED = ("stillness", "closure", "conflict", "progress")  # scores of new monitors
 SMOOTHED = 3  # decisions whose disagreement is averaged: single plans jump at a grasp
-# m, shifts whose distance exceeds the smallest one by less are equal, and the largest counts: plans
-# of a tip at rest are as close at any shift
+# m, shifts whose distance exceeds the smallest one by less are equal, and the largest counts: a tip
+# at rest has plans that are as close at any shift
 _EQUAL = 5e-4
 
 

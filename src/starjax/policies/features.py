@@ -13,7 +13,7 @@ from starjax.sim import names
 from starjax.sim.tasks.base import Task
 from starjax.types import Observation
 
-TROCAR_FEATURES = 7  # of each arm
+TROCAR_FEATURES = 7  # for each arm
 
 _LENGTH = 0.05  # m, the largest displacement of a trocar in Eq. 19: features are of order one
 

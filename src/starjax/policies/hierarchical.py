@@ -60,7 +60,7 @@ def make(
         )
     arms, position, turns = sensors.task.arms, space.slices["p"], slice(space.slices["p"].start)
     outputs = turns.stop  # N: the position is the last part
-    dim = 4 * arms  # of what is generated, see `generated`
+    dim = 4 * arms  # size of what is generated, see `generated`
     networks = generator.make(method, policy_config, sensors, dim)
     model = networks.model
     observed = generator.sizes(policy_config, sensors, dim).observed

@@ -20,7 +20,7 @@ from starjax.policies.base import Params, Policy
 
 TURN = 0.3  # rad, standard deviation of the random turns, and the unit of the network's output
 MAX_TURN = 3.0  # units, of a correction
-HISTORY_NOISE = 0.05  # of the measured 6-D rotations, as of the rolls in `hierarchical`
+HISTORY_NOISE = 0.05  # noise of the measured 6-D rotations, as of the rolls in `hierarchical`
 
 
 class PreparedPoses(NamedTuple):

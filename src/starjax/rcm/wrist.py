@@ -198,7 +198,7 @@ def tip_depth(bend: Pose, length: jax.Array) -> tuple[jax.Array, jax.Array]:
     The second value is True if no bound moved the tip.
     """
     across2 = arrays.dot(bend.p[..., :2], bend.p[..., :2])[..., 0]
-    least = bend.p[..., 2] + manifold.MIN_DEPTH  # of W
+    least = bend.p[..., 2] + manifold.MIN_DEPTH  # depth of W
     length = jnp.minimum(length, 2.0 * manifold.MAX_DEPTH)  # huge squares overflow
     room = length**2 - across2
     depth = jnp.sqrt(jnp.maximum(room, least**2))

@@ -14,7 +14,7 @@ from starjax.evaluation import protocol
 from starjax.report import leaderboard_rows
 from starjax.report.leaderboard_rows import Row
 
-FILES = ("result.json", "sweep.json", "stress.json")  # of a directory
+FILES = ("result.json", "sweep.json", "stress.json")  # files of a directory
 
 
 class OtherTrials(NamedTuple):

@@ -14,7 +14,7 @@ from starjax.report import formats, outcomes, stats
 from starjax.runtime import files
 from starjax.sim import registries
 
-_DIGITS = 8  # of a digest
+_DIGITS = 8  # for a digest
 _SEEN = [True] * protocol.SEEN + [False] * (protocol.TROCARS - protocol.SEEN)
 
 

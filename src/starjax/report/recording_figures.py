@@ -11,7 +11,7 @@ from starjax.report import style
 
 _PATHS = 12  # episodes whose paths are drawn
 _LEAST_MM = 0.01  # range of an axis of distances: rounding errors do not fill it
-_COLOURS = ("#2083C5", "#D55E00", "#009E73", "#CC79A7")  # of the arms
+_COLOURS = ("#2083C5", "#D55E00", "#009E73", "#CC79A7")  # colours of the arms
 
 
 def paths(found: Sequence[EpisodeMotion], dark: bool = False) -> Any:

@@ -17,7 +17,7 @@ _MIN_MM = 1e-2  # RCM error at the centre of its circle
 # Undisturbed to strongest.
 _SHADES = ("#2083C5", "#009E73", "#E69F00", "#D55E00", "#7A1F5C")
 
-Content = Mapping[str, Any]  # of a stress.json
+Content = Mapping[str, Any]  # for a stress.json
 
 
 def table(content: Content) -> formats.Table:

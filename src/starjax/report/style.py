@@ -31,7 +31,7 @@ _LIGHT = {"ink": "#1d2329", "muted": "#6b7480", "line": "#d9dee3", "paper": "#ff
 _DARK = {"ink": "#e6e9ec", "muted": "#98a2ad", "line": "#39424c", "paper": "#171b20"}
 
 
-_DPI = 180  # of a png
+_DPI = 180  # for a png
 
 _SETTINGS: dict[str, Any] = {
     "axes.grid": True,

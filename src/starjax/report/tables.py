@@ -13,7 +13,7 @@ from starjax.report.formats import Table
 TESTS = {"strict": outcomes.strict, "loose": outcomes.loose, "safe": outcomes.safe}
 SWEPT = "Success through other trocars (%)"
 SWEPT_PAIRED = "through these trocars"
-ALL = "all"  # of --against: every pair of runs
+ALL = "all"  # for --against: every pair of runs
 _QUANTILES = ("p50", "p95", "p99")
 _COMPILE = ": compile"  # suffix of a phase's compile time
 

@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-GAIN = 0.02  # of the reward, the least that counts as progress
+GAIN = 0.02  # part of the reward, the least that counts as progress
 
-CAUSES = ("none", "stalled", "clock", "nearly lost")  # of a takeover, by number
+CAUSES = ("none", "stalled", "clock", "nearly lost")  # causes of a takeover, by number
 
 
 class BestReward(NamedTuple):

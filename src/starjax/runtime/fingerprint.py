@@ -143,5 +143,5 @@ class _Walk:
 def _content(cell: types.CellType) -> Any:
     try:
         return cell.cell_contents
-    except ValueError:  # of a function that is defined later
+    except ValueError:  # from a function that is defined later
         return None

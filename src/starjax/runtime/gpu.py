@@ -7,7 +7,7 @@ import importlib.util
 import os
 from pathlib import Path
 
-# Of NVIDIA's driver, of a container that was given one card, of Linux inside Windows (WSL2).
+# NVIDIA's driver, a container with one card, Linux inside Windows (WSL2).
 _DEVICES = ("nvidiactl", "nvidia[0-9]*", "dxg")
 _PLUGINS = ("jax_cuda12_plugin", "jax_cuda13_plugin")
 _DEV = Path("/dev")

@@ -16,7 +16,7 @@ from starjax import errors, extras
 
 SCHEME = "hf://"
 _LIBRARY = "huggingface_hub"
-POLICY_FILE = "policy.safetensors"  # of a repository whose name ends without a file
+POLICY_FILE = "policy.safetensors"  # for a repository whose name ends without a file
 _PART = r"[\w][\w.\-]*"
 # A slash in a branch's name is written %2F, as the Hub's library does.
 _REVISION = r"refs/(?:pr|convert)/[\w.\-]+|(?:[\w.\-]|%2F)+"

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 _PACKAGE = Path(__file__).parents[1]
-_TIMEOUT_S = 10.0  # of git, which may wait for a network's file system
+_TIMEOUT_S = 10.0  # for git, which may wait for a network's file system
 
 
 class Code(NamedTuple):

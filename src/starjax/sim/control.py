@@ -126,7 +126,7 @@ def corrected(pose: Pose, p_trocar: jax.Array, correction: jax.Array) -> Pose:
     """Returns the pose turned about its tip by `correction` `[3]` m of its axis at the trocar."""
     z = pose.R[:, 2]
     depth = (pose.p - p_trocar) @ z
-    correction = jnp.where(depth < 0, -correction, correction)  # of a tip above the trocar
+    correction = jnp.where(depth < 0, -correction, correction)  # sign for a tip above the trocar
     lever = jnp.maximum(jnp.abs(depth), rcm.MIN_DEPTH)
     return Pose(rcm.rotation_align(z, lever * z - correction) @ pose.R, pose.p)
 

@@ -23,7 +23,7 @@ from starjax.types import Pose
 RIGHT = "_right"
 BASELINE = 0.005  # m between the lenses
 NEAR, FAR = 0.1, 0.6  # m from the camera's plane; nearer and farther points are clipped
-_PERIODS = 16  # of the waves between them, 31 mm each
+_PERIODS = 16  # periods of the waves between them, 31 mm each
 
 
 class DerivedView(NamedTuple):

@@ -17,7 +17,7 @@ from starjax.types import Pose
 if TYPE_CHECKING:  # a robot loads tasks without the simulator
     import mujoco
 
-NAME = "endoscope"  # of the camera
+NAME = "endoscope"  # name of the camera
 STREAM = 0x73636F70  # folded into an episode's key: objects and tips are drawn as without it
 
 

@@ -25,7 +25,7 @@ MIN_MARGIN = 0.1  # rad to the nearest limit
 MIN_SINGULAR = 0.03  # m, of [Jv; LEVER Jw]
 REACHED = 1e-4  # m of residual
 LEVER = 0.3  # m: a radian of turn, or of a joint, counts as many metres; the length of a tool
-ITERATIONS = 40  # of inverse kinematics from home
+ITERATIONS = 40  # for inverse kinematics from home
 
 
 class ArmSettings(NamedTuple):

@@ -16,7 +16,7 @@ from starjax import config, errors
 from starjax.evaluation.disturbances import DISTURBANCES, base, parse_levels
 from starjax.types import Observation, Pose
 
-PROBABILITY = 0.5  # of each disturbance in a disturbed sample
+PROBABILITY = 0.5  # probability of each disturbance in a disturbed sample
 ARGUMENT = "train.randomise"
 # Apart from the children of `jax.random.split`, which the policy makes of the same key.
 _STREAM = zlib.crc32(b"randomise")

@@ -97,7 +97,7 @@ def draw_images(
         displace = functools.partial(randomise.displace, names)
         cameras: Pose = jax.vmap(jax.vmap(displace))(draws, source.cameras)
         look = jax.vmap(jax.vmap(functools.partial(randomise.has_look, names)))(draws)
-        lead = source.qpos.shape[:3]  # of samples, steps and the observations of each
+        lead = source.qpos.shape[:3]  # counts of samples, steps and the observations of each
         of_sample = source._replace(qpos=None, cameras=cameras, has_look=look)
         of_sample = jax.tree.map(
             lambda x: jnp.broadcast_to(x[:, :, None], (*lead, *x.shape[2:])), of_sample

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from starjax.training import log
 
-PROJECT = "starjax"  # of Weights & Biases
+PROJECT = "starjax"  # for Weights & Biases
 
 
 class OpenTracker(NamedTuple):

@@ -21,10 +21,10 @@ from starjax.sim import registries, wrists
 from starjax.sim.tasks.base import Task
 
 NAME = "dagger"
-CLOCK_QUANTILE = 0.95  # of the control steps of the policy's successes
+CLOCK_QUANTILE = 0.95  # quantile of the control steps of the policy's successes
 LEAST_RESCUE_S = 15.0  # s, the least that the expert has
 REWINDS_S = (1.0, 2.0, 4.0)  # s before progress ended, at which the expert takes over instead
-ENDS = ("invalid", "collided", "lost")  # of an episode that no signal announced
+ENDS = ("invalid", "collided", "lost")  # causes of an episode that no signal announced
 
 
 def limits(

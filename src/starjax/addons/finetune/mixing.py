@@ -21,7 +21,7 @@ from starjax.rollouts import takeover
 from starjax.runtime import files
 from starjax.training.start import Start
 
-MAX_REPEATS = 5  # of a frame for one of the larger part: more would be remembered, not learned
+MAX_REPEATS = 5  # uses of a frame of the smaller part: more would be remembered, not learned
 
 
 class Part(NamedTuple):

@@ -11,7 +11,7 @@ import numpy as np
 
 from starjax.addons.finetune.explore import Starts
 
-LEVELS = (0.0, 0.25, 0.5, 1.0, 2.0)  # of the setting; 0 for the policy itself
+LEVELS = (0.0, 0.25, 0.5, 1.0, 2.0)  # multiples of the setting; 0 for the policy itself
 LEAST = 0.85  # share of the policy's own successes that the noise may leave
 
 

@@ -19,7 +19,7 @@ from starjax.data import windows
 from starjax.policies.base import Params, Policy
 from starjax.runtime import precompile
 
-CLIP = 0.2  # of the ratio of densities of all executed commands
+CLIP = 0.2  # bound of the ratio of densities of all executed commands
 EPOCHS = 4  # over the decisions of an iteration
 VALUE_EPOCHS = 12  # further ones, of the critic alone
 BATCH = 4096  # decisions per step

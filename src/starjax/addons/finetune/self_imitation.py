@@ -16,8 +16,8 @@ from starjax.rollouts import attempts, episodes, progress, takeover
 from starjax.rollouts.agent import BatchAgent
 
 NAME, SOURCE = "self", "success"
-ATTEMPTS = 3  # of each start
-TEMPERATURE = 1.0  # of the noise that a sample begins with, that of training
+ATTEMPTS = 3  # attempts of each start
+TEMPERATURE = 1.0  # scale of the noise that a sample begins with, that of training
 
 
 def noisy(policy: config.PolicyConfig) -> config.PolicyConfig:

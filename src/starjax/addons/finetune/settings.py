@@ -12,8 +12,8 @@ class FinetuneConfig:
     """Settings of `starjax finetune`, apart from the policy."""
 
     # dagger: an expert finishes episodes in trouble, and the policy learns the expert's part; self:
-    # the policy learns successes of its own noisy rollouts; rl: a policy gradient raises the chance
-    # of strict success; distill: the frozen flow of a policy of onestep teaches it the one step
+    # the policy learns successes of its own noisy rollouts; rl: a policy gradient raises strict
+    # success; distill: the frozen flow of a policy of onestep teaches it the one step
     by: Literal["dagger", "self", "rl", "distill"] = "dagger"
     # directory of a person's interventions, see starjax teleop --policy; dagger learns them too
     interventions: str = ""

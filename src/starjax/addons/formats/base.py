@@ -28,7 +28,7 @@ FORMATS = Registry(
     "starjax.addons.formats.base:Format",
 )
 OURS = "starjax"  # name of the metadata and columns from which an export is restored
-MEMORY_SHARE = 0.25  # of the host's memory, for one episode
+MEMORY_SHARE = 0.25  # part of the host's memory, for one episode
 _MAX_HZ = 1e5
 
 

@@ -104,7 +104,7 @@ def import_mapped(
                 try:
                     centre = found.centres[k.trocar]
                     arrays = _fields(source, mapping, k, hz, folder, centre, notes)
-                except errors.UsageError as error:  # of images, which only this pass reads
+                except errors.UsageError as error:  # from images, which only this pass reads
                     reason = str(error)
             if reason:
                 unread.add(k.episode)

@@ -49,8 +49,8 @@ class ShaftColumns(_MapPart, frozen=True, kw_only=True):
 
     angles: Columns = ()  # pitch and yaw of the wrist, rad, as `rcm.tip_of` has them
     instrument: Literal["", "large_needle_driver", "prograsp"] = ""  # whose wrist it is
-    position: Columns = ()  # of a point of the shaft, 3 numbers
-    rotation: Columns = ()  # of the shaft, as the arm's `rotation_as` says
+    position: Columns = ()  # position of a point of the shaft, 3 numbers
+    rotation: Columns = ()  # rotation of the shaft, as the arm's `rotation_as` says
     body: str = ""  # body or site of the arm's model that is on the shaft
     turn: Quaternion = (1.0, 0.0, 0.0, 0.0)  # wxyz, to z along the shaft, distal
 
@@ -64,11 +64,11 @@ class ShaftColumns(_MapPart, frozen=True, kw_only=True):
 class ArmColumns(_MapPart, frozen=True, kw_only=True):
     """Columns of one arm. Empty ones are not there."""
 
-    position: Columns = ()  # of the tip, 3 numbers
-    rotation: Columns = ()  # of the tip, as `rotation_as` says
+    position: Columns = ()  # position of the tip, 3 numbers
+    rotation: Columns = ()  # rotation of the tip, as `rotation_as` says
     rotation_as: Turned = "quat_xyzw"
     joints: Columns = ()  # instead of the two: positions of the joints, rad and m
-    model: str = ""  # of the robot, an MJCF or URDF beside the mapping file
+    model: str = ""  # model of the robot, an MJCF or URDF beside the mapping file
     joint_names: tuple[str, ...] = ()  # in the model, in the order of `joints`; left out, its first
     body: str = ""  # body or site of the model that is the tip
     gripper: Columns = ()  # one number; left out, the jaws are open throughout
@@ -84,9 +84,9 @@ class ArmColumns(_MapPart, frozen=True, kw_only=True):
     trocar: Columns = ()  # its position, 3 numbers; left out, estimated from the motion
     trocar_at: tuple[float, ...] = ()  # m, instead of the column: in the files' frame
     tip: Vector = (0.0, 0.0, 0.0)  # m, the tip in the frame that the poses are of
-    # of the tip in that frame: z of the tip is the shaft, distal, y where the jaws open
+    # rotation of the tip in that frame: z of the tip is the shaft, distal, y where the jaws open
     tip_turn: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    # of an instrument with a wrist; absent, the tip's z is the shaft. The record of a mapping
+    # shaft of an instrument with a wrist; absent, the tip's z is the shaft. The record of a mapping
     # without it stays the same.
     shaft: ShaftColumns | msgspec.UnsetType = msgspec.UNSET
 
@@ -124,18 +124,18 @@ class Map(_MapPart, frozen=True, kw_only=True):
 
     about: str = ""  # a line for people
     fits: dict[str, int | tuple[str, ...]] = {}  # columns it is for: sizes or first names
-    task: str  # of starjax, whose nominal trocars and cameras the dataset gets
-    units: Literal["m", "mm"] = "m"  # of positions
-    hz: float = 0.0  # of the files, where they do not say it, or say it wrong
+    task: str  # task of starjax, whose nominal trocars and cameras the dataset gets
+    units: Literal["m", "mm"] = "m"  # unit of positions
+    hz: float = 0.0  # rate of the files, where they do not say it, or say it wrong
     time: Columns = ()  # s, where steps are not evenly spaced
     origin: Vector = (0.0, 0.0, 0.0)  # m, of the files' frame in the task's world
-    turn: Quaternion = (1.0, 0.0, 0.0, 0.0)  # of the files' frame in that world
+    turn: Quaternion = (1.0, 0.0, 0.0, 0.0)  # rotation of the files' frame in that world
     state: Columns = ()  # what the task says of its state
     success: Columns = ()  # above 0.5 at the end where an episode succeeded; left out, all did
     trocars: Literal["episode", "dataset"] = "episode"  # what shares a trocar that is estimated
     max_gap_s: float = 0.5  # episodes with a longer gap are left out
     skip: tuple[Count, ...] = ()  # episodes to leave out
-    splits: tuple[str, ...] = ()  # of the files; only their episodes are imported; default: all
+    splits: tuple[str, ...] = ()  # splits whose episodes are imported; default: all
     # where the tool works: as origin and turn say, or the mean trocar at the task's nominal one and
     # the mean shaft pointing down
     place: Literal["files", "trocar"] = "files"

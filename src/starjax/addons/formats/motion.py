@@ -15,11 +15,11 @@ from starjax.addons.formats.base import Source
 from starjax.addons.formats.mapping import ArmColumns, Map
 from starjax.addons.formats.tip_poses import TipPoses
 
-HZ = 30.0  # of every dataset
+HZ = 30.0  # for every dataset
 FAST = 1.0  # m/s, faster tips are jumps
 SPINNING = 15.0  # rad/s, faster turns are jumps
 _FARTHEST = 5.0  # m; tips farther from the origin are in other units
-_EVEN = 0.02  # of a period, by which even steps may be off
+_EVEN = 0.02  # part of a period, by which even steps may be off
 
 
 class Motion(NamedTuple):

@@ -9,10 +9,10 @@ from starjax.addons.formats import mapping as maps
 from starjax.addons.formats import tip_poses
 from starjax.addons.formats.mapping import ArmColumns
 
-_BEYOND = 0.05  # of a gripper's range, by which values may leave it
-_LEAST_USED = 0.5  # of a gripper's range, which a dataset uses
-_STILL = 1e-3  # of a gripper's range, by which jaws that stay closed, or open, move
-_SLACK = 0.02  # of a joint's range, by which values may pass a limit
+_BEYOND = 0.05  # part of a gripper's range, by which values may leave it
+_LEAST_USED = 0.5  # part of a gripper's range, which a dataset uses
+_STILL = 1e-3  # part of a gripper's range, by which jaws that stay closed, or open, move
+_SLACK = 0.02  # part of a joint's range, by which values may pass a limit
 
 
 class Jaws:

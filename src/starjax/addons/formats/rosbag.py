@@ -25,7 +25,7 @@ from starjax.addons.formats import base, per_file, ros_messages, timing
 from starjax.addons.formats.base import Column, Source, StepTimes
 
 _SUFFIXES = (".mcap", ".db3", ".bag")
-_META = "metadata.yaml"  # of a folder that is a rosbag2
+_META = "metadata.yaml"  # for a folder that is a rosbag2
 _TIME = "time"
 _OF_URIS = "#?%"  # characters that rosbags leaves in the URI of an SQLite file
 _KEPT = 4  # episodes whose times are kept

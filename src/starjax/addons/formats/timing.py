@@ -18,8 +18,8 @@ from starjax.addons.formats.base import Source, StepTimes
 APART = 0.1  # s, by which clocks of one episode may differ
 MAX_GAP_S = 0.5  # s without a value, unless a mapping says more
 _RATE = 0.05  # relative, by which a rate may differ from a declared one
-_HZ = 30.0  # of every dataset: faster steps lose nothing
-_PERIODS = 3.0  # of a stream, after which its value is old
+_HZ = 30.0  # for every dataset: faster steps lose nothing
+_PERIODS = 3.0  # periods of a stream, after which its value is old
 _ROUND = 1e-6  # s, of stamps that are sums of seconds and nanoseconds
 _ONE_START = 60.0  # s; clocks farther apart count from starts of their own
 

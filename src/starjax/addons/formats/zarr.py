@@ -22,7 +22,7 @@ from starjax.addons.formats.base import Column, Source
 from starjax.runtime import files
 
 _CHUNK_BYTES = 2_000_000  # as Diffusion Policy has them
-_MAX_CHUNKS = 1_000_000  # of a column of an episode
+_MAX_CHUNKS = 1_000_000  # for a column of an episode
 
 
 def named(column: str) -> str:

@@ -26,7 +26,7 @@ from starjax import rcm
 from starjax.errors import UsageError
 from starjax.types import Pose
 
-_MAX_NORM_ERROR = 1e-3  # of a quaternion's length from one
+_MAX_NORM_ERROR = 1e-3  # deviation of a quaternion's length from one
 
 
 class Frames(NamedTuple):

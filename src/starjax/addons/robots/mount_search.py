@@ -19,7 +19,7 @@ from starjax.sim.workspaces import Workspace
 SINGULAR_WORTH = 4.0  # rad of margin that a metre of singular value is worth
 MEAN_WORTH = 0.1  # weight of the mean over the poses, added to the worst
 TABLE_WORTH = 5.0  # rad of margin that a metre of link in the table costs
-ITERATIONS = 20  # of inverse kinematics from home
+ITERATIONS = 20  # for inverse kinematics from home
 # Differential evolution in rounds; after each the worst poses replace easy ones.
 ROUNDS, GENERATIONS, CANDIDATES = 3, 20, 64
 POSES, REPLACED = 144, 48

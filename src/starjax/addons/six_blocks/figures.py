@@ -8,7 +8,7 @@ from starjax.addons.six_blocks.task import BLOCKS, LIMIT_S
 from starjax.evaluation import statistics
 from starjax.evaluation import trials as tables
 
-# Of FLS: six blocks there and back, without one dropped out of view.
+# Figures of FLS: six blocks there and back, without one dropped out of view.
 PEOPLE = {"ways": 2, "proficient_s": 48.0, "residents_s": 84.0, "limit_s": LIMIT_S}
 
 

@@ -14,7 +14,7 @@ from starjax.sim.tasks.peg_transfer_bimanual import task
 from starjax.types import Pose
 
 BLOCKS = 6
-LIMIT_S = 300.0  # of FLS
+LIMIT_S = 300.0  # for FLS
 
 
 @flax.struct.dataclass

@@ -23,7 +23,7 @@ DRAG = 8.0  # 1/s, of the air: 0.1 g/m of thread falls at about 1 m/s
 FRICTION = 0.5  # on the pad; assumed
 STEPS = 4  # per control period
 TOLERANCE = 1e-3  # relative, of links
-ITERATIONS = 6  # of Newton's method, at most
+ITERATIONS = 6  # for Newton's method, at most
 MAX_BEND = 0.7  # rad between links, a radius of 7 mm: a thread is stiff; assumed
 # Relative: a taut thread between two fixed points has one link more than it needs.
 COMPLIANCE = 1e-3
@@ -141,7 +141,7 @@ def _fixed(thread: Thread, tail: jax.Array, hole: Hole) -> tuple[jax.Array, jax.
     """Returns the points whose position is given, bool `[POINTS, 1]`, and that `[POINTS, 3]` m."""
     along = LINK * jnp.arange(POINTS)[:, None]  # m of thread from the tail
     inside = channel(hole)
-    share = (thread.passed - along) / inside  # of the way through the pad
+    share = (thread.passed - along) / inside  # part of the way through the pad
     is_inside = (thread.place != OUTSIDE) & (share > 0.0) & (share < 1.0)
     depth = DIP * (1.0 - jnp.abs(2.0 * share - 1.0))
     at = hole.entry + share * (hole.exit - hole.entry) - depth * jnp.array([0.0, 0.0, 1.0])
@@ -154,7 +154,7 @@ def _unbent(p: jax.Array) -> jax.Array:
     bend = 0.5 * (p[:-2] + p[2:]) - p[1:-1]
     size = jnp.sqrt(jnp.sum(bend**2, -1, keepdims=True))
     beyond = jnp.maximum(1.0 - LINK * np.sin(MAX_BEND / 2) / jnp.maximum(size, 1e-9), 0.0)
-    move = 0.125 * beyond * bend  # of the neighbours, twice that of the middle: the mean stays
+    move = 0.125 * beyond * bend  # by the neighbours, twice that of the middle: the mean stays
     return p.at[1:-1].add(2.0 * move).at[:-2].add(-move).at[2:].add(-move)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from starjax import errors
 
-_DEAD_ZONE = 0.08  # of a stick's range, about its centre
+_DEAD_ZONE = 0.08  # part of a stick's range, about its centre
 
 
 class Reading(NamedTuple):

@@ -8,7 +8,7 @@ import trimesh
 
 _HIDDEN_GROUP = 3  # geoms of this group and above are not drawn, as in the simulator's camera
 _SEGMENTS = 32  # around a cylinder
-_SUBDIVISIONS = 2  # of the sphere
+_SUBDIVISIONS = 2  # for the sphere
 _SHARP = 0.5  # rad between two faces, beyond which their edge is not shaded smooth
 _FLAT = 2e-4  # m, half thickness of a plane
 _ENDLESS = 0.5  # m, half length of an infinite plane

@@ -9,7 +9,7 @@ import numpy as np
 
 from starjax.addons.viewer.frame import Frame
 
-COLOURS = ("#00796b", "#c2611f")  # of the first and the second rollout
+COLOURS = ("#00796b", "#c2611f")  # colours of the first and the second rollout
 _AXES = ("#c23b3b", "#3f8f3f", "#3b62c2")  # x, y, z, as 3D views colour them
 _SPAN_S = 6.0
 _HEIGHT = 190  # pixels

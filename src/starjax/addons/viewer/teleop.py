@@ -19,7 +19,7 @@ from starjax.addons.viewer.view import REST_S, trocar_names
 from starjax.rollouts import episodes
 
 _PICTURE_WIDTH = 480  # pixels
-_OVER = object()  # of a replay
+_OVER = object()  # for a replay
 
 
 class OperatorEpisode:

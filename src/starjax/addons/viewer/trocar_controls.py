@@ -19,7 +19,7 @@ from starjax.sim.tasks.base import Slot, Task
 _MM, _DEG = 1e3, 180.0 / np.pi
 _UNITS = np.array([_MM, _DEG, _DEG])
 _LABELS = ("r (mm)", "θ (°)", "φ (°)")
-_STEPS = (0.1, 0.5, 1.0)  # of the sliders
+_STEPS = (0.1, 0.5, 1.0)  # for the sliders
 _spherical, _position = jax.jit(rcm.trocar_from_position), jax.jit(rcm.trocar_position)
 
 

@@ -15,10 +15,10 @@ from starjax.sim import registries
 from starjax.types import Pose
 
 COUNT = 256  # poses
-TASK = "peg_transfer"  # of its trocars and tips
+TASK = "peg_transfer"  # task of its trocars and tips
 TOLERANCE = 1e-5  # m, rad; float32 a tenth of a metre from the origin
 MAX_ERROR = 2e-6  # m from the trocar to the shaft, ten times that of the built-in spaces
-LARGE = 1e30  # of an action that is far out
+LARGE = 1e30  # size of an action that is far out
 
 
 def check(name: str, n: int) -> Iterator[Check]:

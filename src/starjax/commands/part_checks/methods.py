@@ -12,7 +12,7 @@ from starjax.policies import policy
 from starjax.runtime import user_code
 from starjax.sim import registries, scene, wrists
 
-TASKS = ("reach", "peg_transfer_bimanual")  # of one arm and of two
+TASKS = ("reach", "peg_transfer_bimanual")  # tasks of one arm and of two
 WRISTED = "needle_driver"  # tool of methods that move a wrist
 # Fields that training depends on: methods with the same weights have the same.
 TRAINED = ("action_space", "sees_trocar", "hierarchical")

@@ -10,10 +10,10 @@ from starjax.types import Pose
 
 TURN_PER_MM = 0.5  # deg that a camera is turned per mm that it is moved
 MAX_BLUR = 4  # px to either side; fixes the shapes of the programs
-PATCHES = 12  # of blood
+PATCHES = 12  # patches of blood
 BLOOD_RGB, SHINE_RGB = (0.42, 0.03, 0.03), (0.97, 0.93, 0.9)
 SHINE = 0.25  # radius of a patch's reflection, as a fraction of the patch's radius
-SHINE_OFFSET = 0.4  # of the reflection to the top left, towards the light, as a fraction likewise
+SHINE_OFFSET = 0.4  # shift of the reflection to the top left, towards the light, likewise
 
 
 def _displace(disturbance: DisturbanceState, cameras: Pose) -> Pose:

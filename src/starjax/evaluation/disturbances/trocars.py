@@ -12,7 +12,7 @@ from starjax.sim import moving_trocars
 from starjax.sim.state import Env, EnvParams, EnvState
 from starjax.types import Command
 
-BREATH_HZ = 0.25  # of a patient at rest
+BREATH_HZ = 0.25  # rate of a patient at rest
 LATENCY_S = 0.1  # s, age of a tracked trocar's measurement
 
 

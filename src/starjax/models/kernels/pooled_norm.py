@@ -102,9 +102,9 @@ def _largest(x: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def _to_chosen(place: jax.Array, g: jax.Array) -> jax.Array:
     """Puts the gradient `g` of each window at its chosen entry: `[N, h, 2, w, 2, C]` float32."""
-    # The first of a pair is the middle of its window; the second is the last there and the first
-    # of the next window. Element-wise in the entries: XLA can fuse it with its consumer.
-    places = np.array([[1, 2], [9, 0]])  # of both, in their window and in the next; 9: nowhere
+    # The first of a pair is the middle of its window; the second is the last there and the next
+    # window's first. Element-wise in the entries: XLA can fuse it with its consumer.
+    places = np.array([[1, 2], [9, 0]])  # both, in their window and in the next; 9: nowhere
     gradient = jnp.float32(0)
     for down, right in np.ndindex(2, 2):
         here = (3 * places[down][:, None] + places[right]).astype(np.uint8)

@@ -19,11 +19,11 @@ class ActConfig:
     """Options of the learner `act`; with the defaults 7 million parameters."""
 
     style_dim: Count = 32  # numbers of the style of a sequence
-    kl_weight: NotNegative = 10.0  # of the style's divergence beside the error, as in ACT
-    width: Count = 256  # of the transformers' tokens
-    heads: Count = 8  # of their attention; divides the width
+    kl_weight: NotNegative = 10.0  # weight of the style's divergence beside the error, as in ACT
+    width: Count = 256  # width of the transformers' tokens
+    heads: Count = 8  # heads of their attention; divides the width
     mlp: Count = 1024  # width of their MLPs
-    style_layers: Count = 2  # of the encoder of styles, which only training needs
+    style_layers: Count = 2  # layers of the encoder of styles, which only training needs
     encoder_layers: Count = 4  # between the tokens of what is observed
     decoder_layers: Count = 2  # between the actions
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:  # it imports jax, which `--help` does without
 class BcConfig:
     """Options of the learner `bc`."""
 
-    mlp_width: Count = 1024  # of the MLP's hidden layers
+    mlp_width: Count = 1024  # width of the MLP's hidden layers
     mlp_blocks: Count = 3  # residual blocks of two layers
     # sequences that it says, of which one is drawn; 1: plain regression
     components: Count = 1

@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # it imports jax, which `--help` does without
 class FlowConfig(unet.UnetConfig):
     """Options of the learner `flow`."""
 
-    euler_steps: Annotated[int, Range(1, 1_000)] = 10  # of a decision
+    euler_steps: Annotated[int, Range(1, 1_000)] = 10  # steps of a decision
 
 
 def make(

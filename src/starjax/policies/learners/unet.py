@@ -15,14 +15,14 @@ if TYPE_CHECKING:  # they import jax, which `--help` does without
 class UnetConfig:
     """Options of learners that undo noise with a U-Net."""
 
-    # of each level of the U-Net
+    # channels of each level of the U-Net
     unet_channels: Annotated[tuple[int, ...], Range(1, 65_536)] = (256, 512, 1024, 2048)
-    # of the U-Net's convolutions, in commands
+    # length of the U-Net's convolutions, in commands
     kernel_size: Annotated[int, Range(1, 4_095, step=2)] = 5
-    groups: Count = 8  # of the U-Net's GroupNorms; divides all of its channels
+    groups: Count = 8  # groups of the U-Net's GroupNorms; divides all of its channels
     # width of the embedding of the time
     time_dim: Annotated[int, Range(4, 65_536, step=2)] = 128
-    # of a sample's first noise; lower: nearer to the likeliest
+    # scale of a sample's first noise; lower: nearer to the likeliest
     temperature: Annotated[float, Range(0.0, 1.0)] = 1.0
 
 

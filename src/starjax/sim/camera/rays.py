@@ -89,7 +89,7 @@ def _round(x, y, f):
     # b^2 - a c = a r^2 - s^2, by Lagrange's identity, has no difference of large squares.
     a = jnp.maximum(square - m * m, _TINY)
     b = away - m * n
-    s = x * wx + y * wy - wz  # of ray and axis: the distance between them times sqrt(a)
+    s = x * wx + y * wy - wz  # product of ray and axis: the distance between them times sqrt(a)
     h = a * r * r - s * s
     t = (-b - jnp.sqrt(jnp.maximum(h, 0.0))) / a
     return square, m, away, a, b, s, h, t

@@ -25,15 +25,15 @@ _VESSELS = (
 )  # fmt: skip
 _WARP = ((1.1, 37.0, 7.0, 0.9), (2.7, 23.0, 4.0, 2.4), (0.4, 9.0, 0.6, 4.4))  # as folds, mm aside
 _FLESH, _DEEP, _FAT = (0.84, 0.42, 0.38), (0.60, 0.20, 0.20), (0.92, 0.72, 0.45)
-_INK = 0.65  # of a vessel over the flesh
+_INK = 0.65  # opacity of a vessel over the flesh
 _CAVITY = (0.13, 0.03, 0.03)  # RGB of rays that miss the ground
-_FAT_FROM, _FAT_TO = 0.45, 0.8  # of the sum of the slow waves, -1 to 1: edge of fat
+_FAT_FROM, _FAT_TO = 0.45, 0.8  # values of the sum of the slow waves, -1 to 1: edge of fat
 _LAMP = (0.004, 0.002, 0.0)  # m from the lens: right, up, back
 _AMBIENT, _DIFFUSE, _WET = 0.22, 0.85, 0.55
 _WET_EXPONENT = 24.0
-_SHADE = 0.6  # of the diffuse light in a shadow
+_SHADE = 0.6  # part of the diffuse light in a shadow
 _CONE = 0.75  # cosine of the angle from the middle of the lamp's cone to its dark edge
-_BRIGHTEST = 1.25  # of the light at the middle, nearer to the lamp
+_BRIGHTEST = 1.25  # multiple of the light at the middle, nearer to the lamp
 
 
 class Look(NamedTuple):

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-CORNERS = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])  # of a square of side 2
+CORNERS = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])  # a square of side 2
 
 
 def rectangle(mj_model: Any, name: str) -> np.ndarray:

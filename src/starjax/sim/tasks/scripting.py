@@ -16,7 +16,7 @@ from starjax.types import Command
 NOISE_STREAM = 1 << 20  # folded into the key: distinct from every attempt's stream
 CORRELATION = 0.4  # s, correlation time of the disturbance
 SMOOTHING = 0.15  # s, time constant of its low-pass, for smooth motion
-SLOPE = 0.15  # of a way's time, at either end, in which its speed changes
+SLOPE = 0.15  # part of a way's time, at either end, in which its speed changes
 JAW_TIME = 0.25  # s to close or open
 JAW_DELAY = 2.0 / CONTROL_HZ  # s, for which jaws are waited for at most
 SHUT = 0.0  # opening below which jaws that touch something have it between them

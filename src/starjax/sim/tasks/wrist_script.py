@@ -16,7 +16,7 @@ from starjax.sim.state import EnvState
 from starjax.sim.tasks import phases, scripting
 from starjax.types import Command, Pose
 
-WRIST = rcm.LARGE_NEEDLE_DRIVER  # of the tasks' tool
+WRIST = rcm.LARGE_NEEDLE_DRIVER  # wrist of the tasks' tool
 DEVIATION = (0.0012, 0.0012, 0.0012, 0.0)  # m, of the disturbed position
 
 

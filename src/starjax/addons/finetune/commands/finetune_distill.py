@@ -17,7 +17,7 @@ from starjax.commands import messages, stage_times
 from starjax.policies import policy_file
 from starjax.policies.in_env import PolicyInEnv
 
-STREAM = 0x6469  # of its draws, folded into the seed's key, then the number of the round
+STREAM = 0x6469  # stream of its draws, folded into the seed's key, then the number of the round
 CALL = 500  # steps between two lines
 
 

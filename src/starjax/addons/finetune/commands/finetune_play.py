@@ -17,7 +17,7 @@ from starjax.policies.base import Policy
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import trocars as configurations
 
-LIMIT = 1.5  # of the time of the slowest 5% of successes, after which an episode has failed
+LIMIT = 1.5  # times the slowest 5% of successes, after which an episode has failed
 AGAIN = 0.5  # share of a batch's episodes whose starts failed in the one before
 
 

@@ -17,7 +17,7 @@ from starjax.policies import policy_file
 from starjax.policies.in_env import PolicyInEnv
 from starjax.runtime import files, precompile
 
-STREAM = 0x726C  # of its starts, folded into the seed's key, then the number of the round
+STREAM = 0x726C  # stream of its starts, folded into the seed's key, then the number of the round
 ALONE = 1  # first iterations, in which the critic learns alone
 
 

@@ -29,7 +29,7 @@ from starjax.rollouts import trocars
 from starjax.runtime import files
 
 _WARMUP = 500  # training steps, in which the new optimiser's averages settle
-_DIGITS = 12  # of a digest in messages
+_DIGITS = 12  # for a digest in messages
 _MAY_CHANGE = ("rounds", "minutes", "eval")  # settings that may change when a fine-tuning resumes
 
 

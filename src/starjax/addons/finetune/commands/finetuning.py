@@ -17,7 +17,7 @@ from starjax.commands import messages, policy_args, policy_evaluation, session, 
 from starjax.evaluation import statistics
 from starjax.runtime import files, precompile, processes
 
-_PEAK = "peak_bytes_in_use"  # of a device's statistics, which a CPU does not have
+_PEAK = "peak_bytes_in_use"  # for a device's statistics, which a CPU does not have
 _WAYS = {
     "dagger": finetune_stages.Imitation,
     "self": finetune_stages.Imitation,

@@ -16,7 +16,7 @@ from starjax.sim.tasks.phases import GraspT
 ARRIVED = 0.0005  # m from a goal, within which the next phase begins
 OPEN = 0.98  # opening from which jaws count as open, and -OPEN as closed
 LEFT = 0.2  # the least fraction of a way or turn that is left, where it determines its start
-ROUNDS = 4  # of the search for the duration, which depends on the way's length
+ROUNDS = 4  # for the search for the duration, which depends on the way's length
 LONGEST = 0.1  # m, of a whole way: the longest between pegs
 _SHARE = np.linspace(0.0, 0.95, 96)
 

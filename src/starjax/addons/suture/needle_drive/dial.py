@@ -27,7 +27,7 @@ TURNS = (float(np.deg2rad(84.0)), float(np.deg2rad(150.0)))  # rad
 SHORTEST, LONGEST = (
     2.0 * SIZE.radius * float(np.sin(0.5 * (turn - AROUND))) for turn in TURNS
 )  # m
-BINS = 6  # of the turn, the label of an episode
+BINS = 6  # bins of the turn, the label of an episode
 
 # Found by a search for one lean of the plane at every trocar up to the largest turn.
 GRASP_TURN, GRASP_LEAN = float(np.deg2rad(135.0)), float(np.deg2rad(50.0))

@@ -34,14 +34,14 @@ if TYPE_CHECKING:  # a robot loads tasks without the simulator
     import mujoco
 
 # Draws. Directions in which one grasp serves every trocar with the roll within 1.6 rad of its zero.
-SPREAD = 0.006  # of the bite's middle, either way
+SPREAD = 0.006  # spread of the bite's middle, either way
 DIRECTION = (float(np.deg2rad(150.0)), float(np.deg2rad(270.0)))
 TIP_HOME = (0.0, 0.0, 0.05)
 TIP_SPREAD = 0.008  # each axis, at most
 
 # Strict success, for SETTLE_STEPS control steps.
-ON_MARK = 0.001  # of entry and exit
-EMERGED = 0.003  # of wire, enough to be taken
+ON_MARK = 0.001  # for entry and exit
+EMERGED = 0.003  # length of wire, enough to be taken
 # N across the hole: at it a point of the hole has given way by the tolerance of the marks.
 MAX_FORCE = hole.ACROSS * ON_MARK
 SETTLE_STEPS = 15

@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # a robot loads tasks without the simulator
     import mujoco
 
 MAX_TILT = float(np.deg2rad(30.0))
-SPREAD = (0.015, 0.010)  # of the needle's centre on the plate, either way
+SPREAD = (0.015, 0.010)  # spread of the needle's centre on the plate, either way
 TIP_HOME = (0.0, 0.0, 0.06)
 
 # The grasp: fraction of the wire from its swage, and angle to a square one.
@@ -183,7 +183,7 @@ def status(
     as_driving = is_as_for_driving(measurements)
     success_now = held.success_now & as_driving
     stage = jnp.where(as_driving, held.stage, jnp.minimum(held.stage, 2))
-    share = held.reward * (len(STAGES) - 1) - held.stage  # of the stage that is reached
+    share = held.reward * (len(STAGES) - 1) - held.stage  # part of the stage that is reached
     reward = (stage + jnp.clip(share, 0.0, 1.0)) / (len(STAGES) - 1)
     reward = jnp.where(success_now, 1.0, jnp.minimum(reward, 1.0))
     return held._replace(success_now=success_now, stage=stage, reward=reward)

@@ -42,7 +42,7 @@ CURL = 40.0  # 1/m
 HEADING_SPREAD = float(np.deg2rad(20.0))
 
 PULLED = 0.050  # m of thread out of the exit
-ON_POINT = 0.5  # of the arc from its middle to the point: beyond it jaws hold the point's half
+ON_POINT = 0.5  # part of the arc from its middle to the point: beyond it jaws hold the point's half
 SETTLE_STEPS = 15
 STALLED_S = 7.0  # a second grasp of the point takes 5.3 s
 DEMO_STEPS = round(50 * CONTROL_HZ)  # enough for the expert and a few second attempts

@@ -142,7 +142,7 @@ def _dataset(folder: str, image_size: int) -> Show:
 
     try:
         dataset = browse.open_dataset(hub.dataset("--dataset", folder), image_size)
-    except ValueError as error:  # of a damaged file, which it names
+    except ValueError as error:  # from a damaged file, which it names
         raise errors.UsageError("--dataset", "a folder of demonstrations", error) from error
     episodes = browse.of_dataset(dataset)
     return lambda server, should_stop: browse.run(server, episodes, should_stop)

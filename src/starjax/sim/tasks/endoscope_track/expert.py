@@ -18,7 +18,7 @@ from starjax.sim.tasks.endoscope_track.task import DISTANCE, looking_at
 from starjax.types import Agent, Command
 
 FIND_TIME = (1.0, 1.6)  # s, range of the way to the target
-DISTURBED_DISTANCE = (0.9, 1.1)  # of DISTANCE, range of an episode's executed distance
+DISTURBED_DISTANCE = (0.9, 1.1)  # parts of DISTANCE, range of an episode's executed distance
 BULGE = 0.008  # m, the arc's largest offset from the line
 DEVIATION = (0.0008, 0.0008, 0.0008, 0.012)  # m and rad, of the disturbance
 DISTURBANCE = 0.7  # its weight once the target is reached

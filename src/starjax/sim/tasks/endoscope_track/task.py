@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # a robot loads tasks without the simulator
 
 CAMERA = "endoscope"
 UP = (-1.0, 0.0, 0.0)
-DISTANCE = 0.06  # of the target from the lens
+DISTANCE = 0.06  # distance of the target from the lens
 
 # The target's path: two oscillations a coordinate, about a centre.
 CENTRE = (0.0, 0.0, 0.022)
@@ -31,13 +31,13 @@ SHARES = (0.7, 0.3)
 RATES = ((0.35, 0.6), (0.8, 1.2))  # rad/s, ranges
 
 # Start of an episode: the lens looks at CENTRE from afar, with the target in the image.
-START = 0.07  # of CENTRE from the lens
-SPREAD = 0.003  # of the lens, each axis, at most
+START = 0.07  # distance of CENTRE from the lens
+SPREAD = 0.003  # spread of the lens, each axis, at most
 
 # Strict success: on target for SHARE of the control steps from FIRST to LAST.
-OFF_CENTRE = 0.05  # of the picture's side
+OFF_CENTRE = 0.05  # part of the picture's side
 TILT = float(np.deg2rad(3.0))
-FAR = 0.2  # of DISTANCE, either way
+FAR = 0.2  # part of DISTANCE, either way
 FIRST, LAST = round(2 * CONTROL_HZ), round(29 * CONTROL_HZ)
 SHARE = 0.9
 MAY_MISS = round((1.0 - SHARE) * (LAST - FIRST))

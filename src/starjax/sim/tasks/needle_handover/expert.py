@@ -52,7 +52,7 @@ def _choose(key: jax.Array, state: EnvState) -> tuple[jax.Array, jax.Array, jax.
     key, key_tempo, key_pair = jax.random.split(key, 3)
     R = state.measurements.needle.R
     give, take = PAIRS.T
-    skew = jnp.abs(TANGENTS @ R[1])  # of each segment's normal from the world's y
+    skew = jnp.abs(TANGENTS @ R[1])  # tilt of each segment's normal from the world's y
     aside = (MIDDLES[take] - MIDDLES[give]) @ R[0]
     score = (ASIDE * aside - skew[give] - skew[take]) / SKEW
     pair = jax.random.categorical(key_pair, score)

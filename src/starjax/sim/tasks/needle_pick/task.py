@@ -20,12 +20,12 @@ if TYPE_CHECKING:  # a robot loads tasks without the simulator
     import mujoco
 
 # The needle, as in needle_pick.xml (a test holds these to the compiled model).
-SEGMENTS = 7  # of the wire; the last one ends in the point
-RADIUS = 0.00828  # of the arc
+SEGMENTS = 7  # for the wire; the last one ends in the point
+RADIUS = 0.00828  # radius of the arc
 SWEEP = np.pi  # rad
 
 # Where an episode begins.
-SPREAD = (0.035, 0.025)  # of the needle's centre, either way
+SPREAD = (0.035, 0.025)  # spread of the needle's centre, either way
 TIP_HOME = (0.0, 0.0, 0.05)
 TIP_SPREAD = 0.01  # each axis, at most
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # a robot loads tasks without the simulator
 
 # The block, as in world.xml (a test holds these to the compiled model).
 RIM_RADIUS = 0.007  # from the axis to a wall's centre line
-WALL_RADIUS = 0.0015  # of the capsules
+WALL_RADIUS = 0.0015  # radius of the capsules
 RIM_HEIGHT = 0.009  # above the board when it stands
 WALLS = 3
 PEG_HEIGHT = 0.012

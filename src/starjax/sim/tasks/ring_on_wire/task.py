@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # a robot loads tasks without the simulator
 BENDS = (-0.045981, -0.025981, -0.01299, 0.0, 0.01299, 0.025981, 0.045981)
 HEIGHTS = (0.022, 0.022, 0.0295, 0.022, 0.0295, 0.022, 0.022)  # z of them
 TAB = 0.0110  # from the ring's centre to where its tab is held
-HANG = 0.00414  # of the hanging ring's centre below the wire's axis
+HANG = 0.00414  # height of the hanging ring's centre below the wire's axis
 
 # Where an episode begins.
 START = 0.037  # from the wire's middle
