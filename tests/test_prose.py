@@ -113,26 +113,26 @@ BUDGETS = {
 }
 # Highest counts in tests, benchmarks and experiments.
 BESIDE_BUDGETS = {
-    "ATTR": (24, 6, 0),
-    "WHAT": (112, 42, 1),
+    "ATTR": (24, 4, 2),
+    "WHAT": (115, 35, 7),
     "NONE": (5, 2, 0),
-    "THERE": (8, 0, 0),
+    "THERE": (9, 0, 0),
     "IDIOM": (27, 1, 0),
-    "GO_ON": (2, 1, 0),
-    "BESIDE": (21, 19, 0),
+    "GO_ON": (2, 0, 0),
+    "BESIDE": (22, 17, 2),
     "SPLICE": (0, 0, 0),
-    "INVERTED": (15, 7, 0),
-    "ANTHRO": (38, 6, 1),
+    "INVERTED": (15, 4, 3),
+    "ANTHRO": (39, 5, 2),
     "SO_THAT": (15, 8, 0),
     "EACH": (1, 5, 1),
     "PER": (1, 13, 0),
     "IS_TO": (1, 0, 0),
     "WHERE": (19, 4, 0),
-    "LEFT_OUT": (7, 3, 1),
-    "ARTICLE": (1, 4, 3),
+    "LEFT_OUT": (7, 2, 2),
+    "ARTICLE": (1, 1, 4),
 }
 # Highest numbers of comments that begin with "of" in src, tests, benchmarks and experiments.
-OF = (0, 50, 24, 0)
+OF = (0, 52, 20, 4)
 # Most bullets of a version in the changelog, and words of a bullet.
 BULLETS, WORDS = 60, 25
 # Highest numbers of first docstring lines that begin with a question word, of functions without a

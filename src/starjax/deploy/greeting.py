@@ -142,7 +142,7 @@ def _scene(value: Any) -> names.SceneNames:
         row = rows[field] = value.get(field) or []
         if not isinstance(row, list) or not all(isinstance(name, str) for name in row):
             raise UsageError(f"greeting.scene.{field}", "a list of names", repr(row)[:80])
-    from starjax.sim import scene  # of an evaluation; a robot has no simulator
+    from starjax.sim import scene  # for an evaluation; a robot has no simulator
 
     return scene.name(value["task"], rows["arms"], rows["tools"], rows["cameras"])
 

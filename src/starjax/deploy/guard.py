@@ -15,12 +15,12 @@ from starjax.types import Pose
 
 MAX_OFF_TROCAR = 0.003  # m, from the measured shaft to the trocar: beyond, its wall would be pushed
 MAX_FOLLOWING = 0.004  # m, from the measured tip to the nearest of the last commands
-MAX_AGE_S = 0.2  # of measurements and images
+MAX_AGE_S = 0.2  # age of measurements and images
 MAX_MOVED = 0.001  # m, of a measured trocar since the plans began
 MAX_FIRST = 0.003  # m, from a robot's setpoint to the first command
 MAX_FUTURE_S = 0.02  # s, by which stamps may be ahead of the clock
 MAX_MISFIT = 0.002  # m, between a measured tip and that of the measured joints
-MAX_SKEW = 0.05  # of R'R from the identity, far above rounding and calibration errors
+MAX_SKEW = 0.05  # deviation of R'R from the identity, far above rounding and calibration errors
 FOLLOWED = 3  # last commands, one of which the arm must be near: 0.1 s of latency
 STALE = ("stale pose", "stale image")
 

@@ -11,7 +11,7 @@ import numpy as np
 from jax import core
 from jax.typing import ArrayLike
 
-MAX_PROGRAMS = 64  # of a map, one per combination of shapes and types
+MAX_PROGRAMS = 64  # programs of a map, one per combination of shapes and types
 _VALUES = (jax.Array, np.ndarray, np.number, np.bool_, int, float)
 _BOUND = 1e30  # bound of finite inputs: their sums and squares do not overflow
 

@@ -26,7 +26,7 @@ from starjax.rcm import arrays, manifold, rotations, wrist_checks
 from starjax.types import Pose
 
 _E_Z = np.array([0.0, 0.0, 1.0], np.float32)
-MAX_SKEW = 1e-3  # of a requested matrix from a rotation
+MAX_SKEW = 1e-3  # deviation of a requested matrix from a rotation
 _FARTHEST = 1e9  # m; bound of offsets from the trocar, whose squares stay finite
 
 

@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import Any
 
 _SUFFIXES = (".py", ".xml", ".toml", ".json")
-_started = time.time()  # of this process, about
+_started = time.time()  # start of this process, about
 
 
 class Missing(LookupError):
@@ -51,7 +51,7 @@ def _files(package: str) -> tuple[Path, ...]:
         return ()
     try:
         spec = importlib.util.find_spec(package)
-    except ValueError:  # of a script, a notebook, or made by hand
+    except ValueError:  # from a script, a notebook, or made by hand
         spec = None
     if spec is None or not (places := spec.submodule_search_locations or [spec.origin or ""]):
         raise Missing(f"no files of {package}")

@@ -39,7 +39,7 @@ LIMITS = np.array(
 # Beyond these a joint is in degrees or mm: wider than the limits of any such arm.
 _RANGES = np.array([[-np.pi, np.pi]] * 2 + [[-0.05, 0.4], [-2 * np.pi, 2 * np.pi]] + [[-2, 2]] * 2)
 _FARTHEST = 0.5  # m, from the remote centre to a tip
-_MAX_SKEW = 1e-3  # of a matrix from a rotation
+_MAX_SKEW = 1e-3  # deviation of a matrix from a rotation
 _TINY = 1e-12
 # The shaft's frame at zero in the base frame: its z points down.
 _R_BASE_SHAFT = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
