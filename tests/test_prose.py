@@ -121,7 +121,7 @@ BESIDE_BUDGETS = {
     "GO_ON": (2, 0, 0),
     "BESIDE": (22, 17, 2),
     "SPLICE": (0, 0, 0),
-    "INVERTED": (15, 4, 3),
+    "INVERTED": (14, 4, 3),
     "ANTHRO": (39, 5, 2),
     "SO_THAT": (15, 8, 0),
     "EACH": (1, 5, 1),
@@ -132,7 +132,7 @@ BESIDE_BUDGETS = {
     "ARTICLE": (1, 1, 4),
 }
 # Highest numbers of comments that begin with "of" in src, tests, benchmarks and experiments.
-OF = (0, 52, 20, 4)
+OF = (1, 52, 20, 4)
 # Most bullets of a version in the changelog, and words of a bullet.
 BULLETS, WORDS = 60, 25
 # Highest numbers of first docstring lines that begin with a question word, of functions without a
