@@ -38,6 +38,14 @@ def half(x):
     return 0.5 * x
 
 
+def with_keys(keys):
+    def run(state, scale):
+        TRACES.append(1)
+        return state, {"sum": jnp.sum(jax.vmap(jax.random.normal)(keys)) * scale}
+
+    return run
+
+
 def steps(count, factor):
     def run(state, scale):
         TRACES.append(1)
@@ -125,6 +133,9 @@ def test_any_change_is_traced_again(folder, part, tmp_path, monkeypatch):
     changes = {
         "closure": lambda: call(part, part.steps(4, 2.0)),
         "array": lambda: call(part, part.steps(3, np.array([1.0, 2.0, 3.0, 4.0]))),
+        "key": lambda: call(part, part.steps(3, jax.random.uniform(jax.random.key(1)))),
+        "keys": lambda: call(part, part.with_keys(jax.random.split(jax.random.key(2), 3))),
+        "other keys": lambda: call(part, part.with_keys(jax.random.split(jax.random.key(3), 3))),
         "content of an array": lambda: call(part, part.steps(3, np.array([1.0, 2.0, 3.0, 5.0]))),
         "shape": lambda: call(part, state=part.State(jax.random.key(0), jnp.arange(5.0))),
         "type": lambda: call(part, state=part.State(jax.random.key(0), jnp.arange(4))),

@@ -22,6 +22,8 @@ _BY_REPR = (
     np.dtype, jax.ShapeDtypeStruct, jax.sharding.Mesh, jax.sharding.PartitionSpec,
     jax.sharding.Sharding,
 )  # fmt: skip
+# Functions of scripts and notebooks see variables that change, and are in no file of a package.
+_INTERACTIVE = ("__main__", "__mp_main__")
 
 
 class Unknown(TypeError):
@@ -44,7 +46,7 @@ def of(*objects: Any) -> Content:
     """Returns the content of objects: constants, containers, arrays, functions with closures.
 
     Raises:
-      Unknown: one holds an object of another kind.
+      Unknown: one holds an object of another kind, or a function of a script or a notebook.
     """
     walk = _Walk()
     for x in objects:
@@ -136,6 +138,8 @@ class _Walk:
 
     def _name(self, x: Any) -> str:
         module = getattr(x, "__module__", None) or "builtins"
+        if module in _INTERACTIVE:
+            raise Unknown(f"{x!r:.80} of a script or a notebook")
         self.modules.add(module)
         return f"{module}:{getattr(x, '__qualname__', x.__name__)}"
 

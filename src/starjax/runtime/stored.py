@@ -85,7 +85,7 @@ def _find(function: Callable[..., Any], args: Any) -> Stored | None:
             return stored
         _explain(f"{name} is traced: not in {folder}")
         return _export(function, args, device.platform, path)
-    except (fingerprint.Unknown, package_files.Missing, NotImplementedError, ValueError) as error:
+    except Exception as error:  # an error of the function itself is raised again by its trace
         _explain(f"{name} is traced: {error}")
         return None
 
@@ -147,7 +147,8 @@ def _key(function: Callable[..., Any], args: Any) -> str:
     tree = jax.tree.unflatten(structure, shapes)
     names = sorted(set(jax.config.values) - set(_FREE))
     settings = [(name, str(getattr(jax.config, name, jax.config.values[name]))) for name in names]
-    content = fingerprint.of(function, tree, settings)
+    with jax.ensure_compile_time_eval():  # reads arrays of closures inside a trace
+        content = fingerprint.of(function, tree, settings)
     code = package_files.digests(content.modules)
     return hashlib.sha256(repr((content.digest, code)).encode()).hexdigest()
 
