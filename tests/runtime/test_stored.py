@@ -263,6 +263,14 @@ def test_donated_arguments_are_given_away(folder, part):
     assert len(part.TRACES) == 1
 
 
+def test_results_are_arguments_of_the_same_executable(folder, part):
+    program = Program(part.steps(3, 2.0))
+    state = jax.device_put(part.State(jax.random.key(0), jnp.arange(4.0)), jax.devices()[0])
+    for _ in range(3):
+        state, _ = program(state, 0.5)
+    assert program._function._cache_size() == 1
+
+
 def test_several_devices_and_tracers_are_traced_anew(folder, part):
     state = part.State(jax.random.key(0), jnp.arange(4.0))
     program = Program(part.steps(3, 2.0))

@@ -112,7 +112,10 @@ def of_episodes(made: mdp.Episodes, lanes: int) -> EpisodeBatch:
     def empty() -> Lanes:
         keys = jax.vmap(jax.random.key)(jnp.zeros(lanes, jnp.uint32))
         state = jax.tree.map(lambda s: jnp.zeros((lanes, *s.shape), s.dtype), one)
-        return Lanes(keys, jnp.zeros(lanes, jnp.int32), state)
+        # On a device by choice, as results of stored programs are: else `advance` compiles twice.
+        return jax.device_put(
+            Lanes(keys, jnp.zeros(lanes, jnp.int32), state), jax.local_devices()[0]
+        )
 
     observed = Program(made.observe).shapes(one)
     camera = Program(jax.vmap(made.camera))
