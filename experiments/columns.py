@@ -176,6 +176,7 @@ def _by_turn(part: str, k: int, scored: Scored) -> str:
 
 
 COLUMNS: dict[str, tuple[str, Callable[[Scored], str]]] = {
+    "task": ("task", lambda x: x.run.result.scene.task.replace("_", " ")),
     "seen": ("seen", lambda x: rate(_seen(x))),
     "unseen": ("unseen", lambda x: rate(_unseen(x))),
     "all": ("all", lambda x: rate(x.run.trials)),

@@ -9,7 +9,7 @@ from starjax import errors
 
 # Extra -> imported packages. Without extras, `starjax.rcm` works with jax and numpy.
 PACKAGES: dict[str, tuple[str, ...]] = {
-    "sim": ("filelock", "flax", "msgspec", "mujoco", "rich", "tyro"),
+    "sim": ("filelock", "flatbuffers", "flax", "msgspec", "mujoco", "rich", "tyro"),
     "train": ("optax", "orbax", "safetensors", "scipy"),
     "report": ("PIL", "jinja2", "matplotlib", "scipy"),
     "video": ("imageio_ffmpeg",),

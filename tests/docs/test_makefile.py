@@ -8,7 +8,7 @@ import subprocess
 import pytest
 
 pytestmark = pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
-TARGETS = {"see": "see", "run": "main", "test": "tests"}  # target -> block of the README
+TARGETS = {"run": "main", "test": "tests"}  # target -> block of the README
 
 
 def make(folder, *args):
@@ -38,6 +38,11 @@ def test_readme_prints_the_lines_of_make(folder, pytestconfig, target, block):
     assert match
     lines = [line for line in make(folder, "CUDA=", target) if not line.startswith("touch ")]
     assert lines == match[1].splitlines()
+
+
+def test_readme_names_the_last_line_of_make_see(folder, pytestconfig):
+    readme = (pytestconfig.rootpath / "README.md").read_text()
+    assert f"`{make(folder, 'CUDA=', 'see')[-1]}`" in readme
 
 
 def test_set_up_is_done_once_and_again_when_dependencies_change(folder):

@@ -154,4 +154,4 @@ def test_included_files_are_as_they_are(page, root):
 
 
 def test_readme_is_short(root):
-    assert len((root / "README.md").read_text().splitlines()) <= 130
+    assert len((root / "README.md").read_text().splitlines()) <= 110

@@ -122,7 +122,8 @@ def _export(function: Callable[..., Any], args: Any, platform: str, path: Path) 
     platforms = None if platform == jax.default_backend() else [platform]
     exported = export.export(jax.jit(flat), platforms=platforms)(*shapes)
     stored = Stored(exported, results[-1])
-    with contextlib.suppress(OSError, TypeError, ValueError):  # e.g. no permission
+    # No permission, or no package flatbuffers: the program runs and is not stored.
+    with contextlib.suppress(ImportError, OSError, TypeError, ValueError):
         result = json.dumps(tree_json.encode(stored.result)).encode()
         content = result + b"\n" + bytes(exported.serialize())
         _evict(path.parent)
