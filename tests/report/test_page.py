@@ -7,6 +7,7 @@ import html
 import os
 import pathlib
 import re
+import shlex
 
 import pytest
 from report.conftest import edited
@@ -31,7 +32,9 @@ def kept(pytestconfig):
     """Results of all methods with their sweeps, and one alone."""
     folder = pytestconfig.rootpath / "experiments"
     paths = {
-        "several": [file.parent for file in sorted(folder.glob("all_methods/*/result.json"))],
+        "several": [
+            file.parent for file in sorted(folder.glob("methods/small_networks/*/result.json"))
+        ],
         "one": [GOLDEN / "result" / "result.json"],
     }
     return {
@@ -209,3 +212,34 @@ def test_what_differs_between_runs_is_a_fact_of_each(one):
     facts = sections.facts(runs)
     assert facts["Seed of the trials"] == f"{seed}; {seed + 1}"
     assert (facts["Code"], facts["Robot"]) == ("0123456789, with local changes", "fr5 with grasper")
+
+
+def test_every_failed_trial_has_the_command_that_shows_it(several, tmp_path):
+    run = several[0]
+    lost = [trial for trial in run.trials if not trial.success]
+    command = "starjax evaluate --policy 'my policy.safetensors' --arm panda"
+    evaluated = edited(run, about={"command": command})
+    head, *rows = sections.failed(evaluated)
+    assert len(rows) == len(lost) > 10
+    for row, trial in zip(rows, lost, strict=True):
+        words = shlex.split(row[head.index("Command")])
+        assert words[:6] == [
+            "starjax",
+            "view",
+            "--policy",
+            "my policy.safetensors",
+            "--arm",
+            "panda",
+        ]
+        flags = dict(zip(words[6::2], words[7::2], strict=True))
+        assert flags == {
+            "--seed": str(trial.seed),
+            "--trocar": str(trial.trocar),
+            "--trial": str(trial.trial),
+        }
+    text = html.unescape(page.render([evaluated], evaluated, {}, None))
+    assert all(row[-1] in text for row in rows)
+    (tmp_path / "config.json").write_text("{}")
+    assert f"--run {tmp_path} " in sections.failed(evaluated._replace(path=tmp_path))[1][-1]
+    served = edited(run, about={"command": "starjax evaluate --policy ws://here:8000"})
+    assert sections.failed(served) == []

@@ -1,5 +1,6 @@
 """Facts, headline numbers and tables of the page, without those that a run lacks."""
 
+import shlex
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -92,6 +93,43 @@ def cards(run: results.Run) -> Iterator[Card]:
     if ms := run.result.about.get("inference_ms"):
         more = f"median; 99th percentile {ms['p99']:.1f} ms"
         yield Card("One policy call", f"{ms['p50']:.1f}", " ms", more)
+
+
+def failed(run: results.Run) -> Table:
+    """Makes a row per failed trial with the command that shows it again; empty if none can."""
+    source = _source(run)
+    trials = [trial for trial in run.trials if not outcomes.strict(trial)] if source else []
+    rows = [
+        [
+            str(trial.trocar),
+            str(trial.trial),
+            outcomes.SHORT[outcomes.failure(trial)],
+            f"{trial.steps / run.result.control_hz:.1f}",
+            f"{source} --seed {trial.seed} --trocar {trial.trocar} --trial {trial.trial}",
+        ]
+        for trial in trials
+    ]
+    return [["Trocar", "Trial", "Cause", "After (s)", "Command"], *rows] if rows else []
+
+
+def _source(run: results.Run) -> str:
+    """Returns the begin of `starjax view` with the policy of a run, empty if it is unknown."""
+    try:
+        words = shlex.split(run.result.about.get("command") or "")
+    except ValueError:  # from an edited file
+        return ""
+    arm = [f"--arm {shlex.quote(words[i + 1])}" for i in _flags(words, "--arm")]
+    if (run.path / "config.json").is_file():
+        return " ".join([f"starjax view --run {shlex.quote(str(run.path))}", *arm])
+    policies = [words[i + 1] for i in _flags(words, "--policy") if "://" not in words[i + 1]]
+    return " ".join(
+        [f"starjax view --policy {shlex.quote(p)}" for p in policies[:1]] + arm * bool(policies)
+    )
+
+
+def _flags(words: Sequence[str], flag: str) -> list[int]:
+    """Returns the places of a flag that a value follows."""
+    return [i for i, word in enumerate(words[:-1]) if word == flag]
 
 
 def comparisons(runs: Sequence[results.Run], against: str = "") -> list[TitledTable]:

@@ -20,7 +20,7 @@ from starjax import errors
 
 ACCEPTED = Path(__file__).with_name("accepted.json")
 _OURS = "starjax"
-# Of starjax, a part's code is that of its modules in these packages, without the interfaces.
+# In starjax, a part's code is that of its modules in these packages, without the interfaces.
 _PARTS = (
     *("starjax.sim.tasks.", "starjax.sim.arms.", "starjax.sim.tools.", "starjax.addons."),
     *("starjax.evaluation.disturbances.", "starjax.policies.learners."),

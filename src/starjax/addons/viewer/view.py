@@ -33,6 +33,7 @@ class ViewOptions(NamedTuple):
       trocar: index of the task's trocar configuration.
       seed: seed of the trials.
       sweep: trials that are drawn as dots at their trocars, or None.
+      trial: number of the first trial.
     """
 
     agents: tuple[AgentSpec, ...]
@@ -40,6 +41,7 @@ class ViewOptions(NamedTuple):
     trocar: int = 0
     seed: int = 0
     sweep: SuccessMap | None = None
+    trial: int = 0
 
 
 def run(server: Any, options: ViewOptions, should_stop: Callable[[], bool]) -> str:
@@ -50,7 +52,7 @@ def run(server: Any, options: ViewOptions, should_stop: Callable[[], bool]) -> s
     selection = Selection(server.gui, requests, options)
     page.add_command(server.gui, "Pass control", "T", lambda: page.notify(server, *_HAND))
     rollouts = _load(server, selection, status, options.sweep)
-    rollouts.begin(options.seed, selection.trocar, 0)
+    rollouts.begin(options.seed, selection.trocar, options.trial)
     clock = page.Clock(rollouts.hz)
     while not should_stop():
         requested = requests.pop()

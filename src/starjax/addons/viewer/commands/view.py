@@ -53,6 +53,7 @@ class ViewArgs:
     task: str = config_lib.DEFAULT_TASK  # task of the expert
     arm: str = ""  # robot instead of those of the training
     trocar: Annotated[int, Range(0, 999)] = 8  # index of the trocar configuration
+    trial: Annotated[int, Range(0, 999_999)] = 0  # number of the first trial
     seed: config_lib.Seed = 0  # random seed of the trials
     port: Port = 8080  # port of the page, on this machine only; 0: a free one
     # further names of this machine in a browser's address, such as that of a proxy
@@ -180,6 +181,7 @@ def _live(args: ViewArgs) -> Show:
         args.trocar,
         args.seed,
         _sweep(args, agents[0].task),
+        args.trial,
     )
     return lambda server, should_stop: view.run(server, initial, should_stop)
 
