@@ -123,6 +123,9 @@ def in_the_pad(turn, trocar, lean):
         measurements=types.SimpleNamespace(**now),
         layout=layout,
         measured_trocar=types.SimpleNamespace(p_world_trocar=jnp.asarray(P_TROCARS[trocar])[None]),
+        gripper_target=-jnp.ones(1),
+        gripper=-0.5 * jnp.ones(1),
+        touch=jnp.ones(1, bool),
         step=jnp.asarray(50),
     )
 

@@ -201,6 +201,7 @@ def test_jaws_close_off_the_recorded_grasp_and_the_next_way_begins_there(start):
     script = expert.enter(script, jnp.asarray(expert.DESCEND, jnp.int32), state)
     assert float(jnp.abs(script.miss).max()) > 1e-4
     assert (np.abs(script.miss) <= np.array(expert.MISS)).all()
+    state.gripper_target = state.gripper = jnp.ones(1)
     script = expert.enter(script, jnp.asarray(expert.CLOSE, jnp.int32), state)
     rough, closing, label = expert.AGENT.act(script, state)
     np.testing.assert_allclose(label.pose.p[0], tip.p, atol=1e-6)

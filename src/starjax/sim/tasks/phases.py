@@ -160,13 +160,15 @@ def enter(
         jnp.asarray(rows)[phase] for rows in (timing.duration, timing.speed, timing.jaws)
     )
     duration = jnp.maximum(least, length / speed) / script.tempo
-    # A tool that is high already does not wait for the time of a rise.
-    duration = jnp.where((phase == RAISE) & (length < RISEN), 0.0, duration)
+    limit = scripting.jaw_limit(script.jaws, jaws)
+    # A tool that is high already rises no longer than its jaws take to let go.
+    is_high = (phase == RAISE) & (length < RISEN)
+    duration = jnp.where(is_high, limit - scripting.JAW_DELAY, duration)
     is_of_jaws = jnp.asarray(scripting.is_of_jaws(timing.jaws))[phase]
     return script.replace(
         phase=phase,
         elapsed=jnp.zeros(()),
-        duration=jnp.where(is_of_jaws, scripting.jaw_limit(script.jaws, jaws), duration),
+        duration=jnp.where(is_of_jaws, limit, duration),
         start=script.at,
         goal=goal,
         jaws_from=script.jaws,

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax.sim.state import EnvState
-from starjax.sim.tasks import handover
+from starjax.sim.tasks import handover, phases
 from starjax.sim.tasks.needle_handover.task import PARK
 from starjax.sim.tasks.needle_pick import task as single
 
@@ -39,7 +39,8 @@ HOVER = 0.02  # m above a grasp
 GRASP_ABOVE = 0.001  # m of the tip above the wire: the pads' ends lie 1.5 mm below it
 COME = (0.012, 0.0, 0.021)  # m, start of the taker's way to the wire
 GO = (-0.015, 0.0, 0.026)  # m, the giver's way after the release
-RAISE = 0.03  # m, slowly: the needle is judged meanwhile, and nothing stands still
+# m, slowly, then more in holds: the needle settles in the jaws, and no command stands still
+RAISE, TOP = 0.03, 0.012
 SKEW = 0.1  # sine of the angle between jaws and the world's y at which a preference shows
 ASIDE = 150.0  # 1/m, preference for a taker's segment on its own side
 MIDDLES, TANGENTS = single.segments()
@@ -91,7 +92,7 @@ def goals(
     give, take = wire + jnp.array([0.0, 0.0, above])
     out = handover.OUT * across
     park, up = jnp.array(PARK), jnp.array([0.0, 0.0, HOVER])
-    lifted = state.layout.needle.p[2] + above + HOVER
+    lifted, high = state.layout.needle.p[2] + above + HOVER, MEET[2] + above + RAISE
     goals = jnp.stack(
         [
             jnp.stack([give + out[0] + up, park[1]]),
@@ -104,8 +105,8 @@ def goals(
             tips.at[1].set(take),
             tips,
             tips.at[0].set(give + jnp.array(GO)),
-            tips.at[1, 2].max(MEET[2] + above + RAISE),
-            tips,
+            tips.at[1, 2].max(high),
+            tips.at[1, 2].set(jnp.clip(high + TOP, tips[1, 2], tips[1, 2] + phases.RISE)),
         ]
     )
     return goals, normal

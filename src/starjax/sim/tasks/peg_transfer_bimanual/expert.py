@@ -45,6 +45,8 @@ RELEASE_HEIGHT = 0.0012  # m above the grasp's height, of the release
 RELEASE_SHIFT = 0.0005  # m further out along the wall's normal: room for the inner pad
 COME = (0.0125, 0.0, 0.0215)  # m, start of the taker's way to the wall
 GO = (-0.015, 0.0, 0.026)  # m, the giver's way after the release
+# m, the taker's: along its shaft, which leans to that side and would sweep the block, straight up
+OFF = (0.015, 0.0, 0.026)
 
 
 def _choose(key: jax.Array, state: EnvState) -> tuple[jax.Array, jax.Array, Any]:
@@ -107,7 +109,7 @@ def _goals(script: handover.HandoverScript, state: EnvState) -> tuple[jax.Array,
             jnp.stack([park[0], jnp.append(over, height + HOVER + OVER)]),
             jnp.stack([park[0], jnp.append(over, height + RELEASE_HEIGHT)]),
             held,
-            held.at[1].add(up),
+            held.at[1].add(jnp.array(OFF)),
             held.at[1, 2].set(jnp.clip(PARK[1][2], tips[1, 2], tips[1, 2] + phases.RISE)),
         ]
     )
