@@ -91,6 +91,7 @@ def _row(asked: argparse.Namespace, row: tuple[str, str, str, str]) -> tuple[str
     one.task, arm, tool, one.expert = row
     one.arm, one.tool = [arm] if arm else [], [tool] if tool else []
     name, start = _label(row), time.perf_counter()
+    results: dict[str, Any]
     try:
         stem, results = _measured(one)
         if one.expert == next(iter(registries.tasks.get(one.task).experts)) or tool:

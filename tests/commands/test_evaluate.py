@@ -117,6 +117,17 @@ def test_how_many_trials_jax_decides_not_the_system(file, monkeypatch, guess, us
         evaluate.main(["--policy", "mine.safetensors"])
 
 
+def test_fewer_executed_commands_make_another_evaluation(file, monkeypatch):
+    def scored(folder, who, *_):
+        raise KeyboardInterrupt(f"{who.trained.policy.execute} in {folder.parent.name}")
+
+    monkeypatch.setattr(policy_evaluation, "rollouts", scored)
+    with pytest.raises(KeyboardInterrupt, match=r"^1 in mine-.*-execute1-seed0-2x1s"):
+        score("--execute", "1")
+    with mistakes.of("--execute", POLICY.horizon + 1):
+        score("--execute", str(POLICY.horizon + 1))
+
+
 @pytest.mark.parametrize("change", [{"temperature": 0.25}, {"ddim_steps": 1}])
 def test_another_way_to_sample_is_another_evaluation(file, change, capsys):
     score("--out", "here")
