@@ -252,12 +252,13 @@ def _keys(description: Mapping[str, Any], records: Sequence[Mapping[str, Any]]) 
     key = jax.random.key(description["seed"])
     of_dataset = jax.random.fold_in(key, schema.stream(description))
 
-    def one(trocar: jax.Array, trial: jax.Array) -> jax.Array:
+    # The key is an argument: as a constant it would make a program of its own for each seed.
+    def one(of_dataset: jax.Array, trocar: jax.Array, trial: jax.Array) -> jax.Array:
         key = jax.random.fold_in(jax.random.fold_in(of_dataset, trocar), trial)
         return jax.random.split(key)[0]
 
     numbers = np.array([(record["trocar"], record["trial"]) for record in records], np.int32)
-    return jax.jit(jax.vmap(one))(*numbers.T)
+    return jax.jit(jax.vmap(one, in_axes=(None, 0, 0)))(of_dataset, *numbers.T)
 
 
 def batch_size() -> int:
