@@ -65,7 +65,7 @@ def evaluate(
     """Scores a policy in closed loop at all trocars of its task, as one program.
 
     >>> figures = starjax.evaluate(policy, trials=1)
-    >>> figures["unseen"]["successes"], figures["unseen"]["trials"], figures["unseen"]["ci95"]
+    >>> figures["unseen"]
 
     Args:
       policy: from `load_policy`.
