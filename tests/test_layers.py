@@ -25,7 +25,7 @@ ROWS = (
     ("api",),
     ("addons",),
 )
-COMMANDS = {"commands", "experiments", "doctor", "cli", "__main__"}  # one layer
+COMMANDS = {"commands", "experiments", "doctor", "cli", "testing", "__main__"}  # one layer
 PLACE = {name: row for row, names in enumerate(ROWS) for name in names}
 
 

@@ -30,7 +30,7 @@ class PartKind(NamedTuple):
 
     Attributes:
       registry: `module:object` of its `Registry`.
-      check: module with the checks of `starjax check`, as those in `commands.part_checks`.
+      check: module with the checks of `starjax check`, as those in `starjax.testing`.
     """
 
     registry: str

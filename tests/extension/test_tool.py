@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from starjax import rcm
-from starjax.commands.part_checks import base
-from starjax.commands.part_checks import tools as checks
 from starjax.sim import mounts, registries, scene
+from starjax.testing import base
+from starjax.testing import tools as checks
 
 
 @pytest.fixture

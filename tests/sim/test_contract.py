@@ -12,9 +12,9 @@ import pytest
 
 from starjax import errors, rcm
 from starjax.commands import check_command
-from starjax.commands.part_checks import tasks as checks
 from starjax.sim import contract, scene, task_draws
 from starjax.sim.tasks.base import Capsules
+from starjax.testing import tasks as checks
 from starjax.types import Agent, Pose
 
 SITE = pathlib.Path(__file__).parents[1] / "extension" / "site"

@@ -11,6 +11,7 @@ from starjax import errors
 from starjax.commands import benchmark_args, messages, options, policy_args, scenes, session
 from starjax.evaluation import disturbances, protocol
 from starjax.limits import NotNegative
+from starjax.registry import Rows
 from starjax.runtime import files
 
 DESCRIPTION = """Scores a trained policy on its task's trocars under disturbances.
@@ -123,7 +124,8 @@ def _kinds(
     from starjax.evaluation.disturbances import base
 
     registry = disturbances.DISTURBANCES
-    kinds = {name: registry.get(name) for name in args.disturbance or registry.names()}
+    kinds = {name: registry.get(name) for name in args.disturbance}
+    kinds = kinds or dict(Rows(registry))  # without those of broken packages
     for name in args.disturbance:
         if observation != "image" and kinds[name].image_only:
             raise errors.UsageError("disturbance", "one that applies to states", name)

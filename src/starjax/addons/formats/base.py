@@ -122,9 +122,22 @@ class Format(NamedTuple):
     write: Callable[[Path, Source, bool], None] | None = None
 
 
+def names_in(about: Any, column: str, shape: tuple[int, ...]) -> tuple[str, ...]:
+    """Returns the names of a column's entries in a file's metadata, which are not trusted."""
+    names = about.get(column) if isinstance(about, dict) else None
+    is_whole = isinstance(names, list) and len(names) == math.prod(shape)
+    return tuple(map(str, names)) if is_whole else ()
+
+
+def names_of(source: Source) -> dict[str, list[str]]:
+    """Returns the names of entries by column, for a file's metadata."""
+    return {name: list(column.names) for name, column in source.columns.items() if column.names}
+
+
 def writable() -> list[str]:
     """Returns the names of formats that exports can have."""
-    return [name for name in FORMATS.names() if FORMATS.get(name).write is not None]
+    forms = {name: form for name in FORMATS.names() if (form := _usable(name)) is not None}
+    return [name for name, form in forms.items() if form.write is not None]
 
 
 def detect(path: Path) -> str:
@@ -141,10 +154,20 @@ def detect(path: Path) -> str:
     raise errors.UsageError("PATH", ", ".join(FORMATS.names()), f"{path} of unknown format")
 
 
+def _usable(name: str) -> Format | None:
+    """Returns a format; None, with a warning, for one that is broken or provided twice."""
+    try:
+        return FORMATS.get(name)
+    except errors.UsageError as error:
+        warnings.warn(f"format {name} is skipped: {error}", stacklevel=2)
+        return None
+
+
 def _recognises(name: str, path: Path) -> bool:
     """Returns True if `path` is of a format; False, with a warning, if a package is broken."""
+    form = _usable(name)
     try:
-        return bool(FORMATS.get(name).recognises(path))
+        return form is not None and bool(form.recognises(path))
     except Exception as error:
         if name in FORMATS.built_in:
             raise

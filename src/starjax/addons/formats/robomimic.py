@@ -57,7 +57,7 @@ def _open(path: Path) -> Iterator[Source]:
         first: dict[str, Any] = datasets(demos[sound])
         ours: Any = file.get(base.OURS)
         columns = {
-            name: Column(dataset.shape[1:], dataset.dtype.name)
+            name: Column(dataset.shape[1:], dataset.dtype.name, _names(data, name, dataset))
             for name, dataset in first.items()
             if dataset.shape[:1] == (lengths[sound],) and dataset.dtype.kind in "biuf"
         }
@@ -99,6 +99,7 @@ def _write(path: Path, source: Source, video: bool) -> None:
                     packed["chunks"] = (1, *array.shape[1:])
                 array = array.astype(np.uint8) if array.dtype == bool else array
                 demo.create_dataset(name, data=array, **packed)
+        data.attrs["names"] = np.bytes_(json.dumps(base.names_of(source)))
         data.attrs["total"] = sum(source.lengths)
         about = {"env_name": source.task, "env_type": 2, "env_kwargs": {"robot": source.robot}}
         data.attrs["env_args"] = np.bytes_(json.dumps(about | {"control_freq": source.hz}))
@@ -182,6 +183,10 @@ def _attribute(data: Any, name: str) -> dict[str, Any]:
     except (KeyError, TypeError, ValueError):
         return {}
     return value if isinstance(value, dict) else {}
+
+
+def _names(data: Any, name: str, dataset: Any) -> tuple[str, ...]:
+    return base.names_in(_attribute(data, "names"), name, dataset.shape[1:])
 
 
 def _hz(about: dict[str, Any]) -> float:

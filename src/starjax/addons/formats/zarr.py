@@ -51,7 +51,12 @@ def _open(path: Path) -> Iterator[Source]:
             whole = array.ndim > 0 and array.shape[0] == ends[-1]
             base.require(whole, f"{ends[-1]} frames of {name}", list(array.shape))
         columns = {
-            name: Column(tuple(array.shape[1:]), array.dtype.name) for name, array in arrays.items()
+            name: Column(
+                tuple(array.shape[1:]),
+                array.dtype.name,
+                base.names_in(about.get("names"), name, array.shape[1:]),
+            )
+            for name, array in arrays.items()
         }
 
         def read(episode: int, names: Collection[str]) -> dict[str, np.ndarray]:
@@ -112,7 +117,10 @@ def _write(path: Path, source: Source, video: bool) -> None:
         buffer.flush()
     ends = np.cumsum(source.lengths, dtype=np.int64)
     meta.create_array("episode_ends", data=ends, compressors=None)
-    root.attrs.update({"hz": source.hz, "task": source.task, base.OURS: source.origin})
+    names = base.names_of(source)
+    root.attrs.update(
+        {"hz": source.hz, "names": names, "task": source.task, base.OURS: source.origin}
+    )
 
 
 class _Buffer:

@@ -1,22 +1,23 @@
 """Checks of an image encoder's trunk: its maps, their cells, numbers, gradients."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax.commands.part_checks.base import FAILED, NOTE, Check, attempt, failed, verdict
 from starjax.learners import ENCODERS
 from starjax.models.encoders import ImageEncoder, Trunk
 from starjax.runtime import user_code
+from starjax.testing.base import FAILED, NOTE, Check, attempt, failed, verdict
 
 CELLS = 4  # along a side of the images
 BATCH = 2
 FEATURES = 16
 WIDTH_UNIT = 16  # widths are multiples of it
 TOLERANCE = 1e-4  # between an image in one batch and alone
+SEEN = 1e-5  # least change of a feature
 
 
 def check(name: str, n: int) -> Iterator[Check]:
@@ -27,6 +28,10 @@ def check(name: str, n: int) -> Iterator[Check]:
         return
     yield verdict("record", _record(trunk), f"width {trunk.width}, cells of {trunk.cell} pixels")
     images = jax.random.normal(jax.random.key(0), (BATCH, *2 * (CELLS * trunk.cell,), 3))
+    if trunk.encoder is not None:  # whose trunk need not return maps
+        whole = trunk.encoder(trunk=name, features=FEATURES, width=WIDTH_UNIT)
+        yield from _values(whole, images, trunk.reads_depth)
+        return
     make = user_code.guarded(f"encoder {name}", "make", trunk.make)
     fault, module = attempt("maps", lambda: make(WIDTH_UNIT, jnp.float32, name="trunk"))
     if not fault:
@@ -64,8 +69,24 @@ def _maps(maps: Any) -> Iterator[str]:
         yield f"expected {CELLS} x {CELLS} cells, got {maps.shape[1]} x {maps.shape[2]}"
 
 
-def _values(encoder: ImageEncoder, images: jax.Array) -> Iterator[Check]:
-    """Yields checks of numbers: features, each image for itself, gradients."""
+def _unseen(apply: Callable[..., Any], params: Any, images: jax.Array) -> Iterator[str]:
+    """Yields the channels and quarters of an image that change no feature."""
+    before, half = np.asarray(apply(params, images[:1])), images.shape[1] // 2
+    slices = {"upper": slice(0, half), "lower": slice(half, None)}
+    parts: dict[str, Any] = {
+        f"channel {i}": (slice(None), slice(None), slice(None), i) for i in range(3)
+    }
+    for y, rows in slices.items():
+        for x, columns in zip(("left", "right"), slices.values()):
+            parts[f"{y} {x} quarter"] = (slice(None), rows, columns)
+    for name, part in parts.items():
+        changed = images[:1].at[part].set(images[1:][part])
+        if (moved := float(np.abs(np.asarray(apply(params, changed)) - before).max())) < SEEN:
+            yield f"{name} changes the features by {moved:.2g}, expected {SEEN:g} or more"
+
+
+def _values(encoder: Any, images: jax.Array, reads_depth: bool = False) -> Iterator[Check]:
+    """Yields checks of numbers: features of an image and of each part, gradients."""
     fault, params = attempt("features", lambda: jax.jit(encoder.init)(jax.random.key(1), images))
     if fault:
         yield fault
@@ -78,6 +99,10 @@ def _values(encoder: ImageEncoder, images: jax.Array) -> Iterator[Check]:
     apart = float(np.abs(both[:1] - alone).max())
     mixed = [f"an image's features depend on its batch, by {apart:.2g}"] * (apart > TOLERANCE)
     yield verdict("features", mixed, f"{FEATURES} finite numbers per image, from it alone")
+
+    if not mixed and not reads_depth:  # the channels of depth are digits of one number
+        unseen = _unseen(apply, params, images)
+        yield verdict("input", unseen, "every channel and quarter is seen")
 
     def loss(p: Any) -> jax.Array:
         features: Any = encoder.apply(p, images)

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 
 from starjax import config, config_json, limits
 from starjax.commands import checks, presets, scenes
-from starjax.commands.part_checks.base import NOTE, Check, attempt, verdict
 from starjax.methods import TABLE_II
+from starjax.testing.base import NOTE, Check, attempt, verdict
 
 
 def check(name: str, n: int) -> Iterator[Check]:

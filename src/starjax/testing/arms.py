@@ -5,11 +5,12 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from starjax.commands.part_checks.base import NOTE, Check, attempt, verdict
 from starjax.sim import mounts, names, registries, robot
 from starjax.sim import scene as scenes
 from starjax.sim.arms.base import Arm
+from starjax.testing.base import FAILED, NOTE, Check, attempt, not_finite, outside, verdict
 
+RANGES = {"max_speed": (1e-3, 50.0), "servo_frequency": (1.0, 2e3), "link_radius": (1e-3, 0.3)}
 HOLD_S = 1.0
 MAX_SAG = 1e-4  # m that the tip may move in `HOLD_S`
 
@@ -19,8 +20,13 @@ def check(name: str, n: int) -> Iterator[Check]:
     fault, arm = attempt("record", lambda: registries.arms.get(name))
     if not fault:
         fault, _ = attempt("record", lambda: robot.read(arm))
-    yield fault or Check("record", f"{len(arm.joints)} joints with servos, flange")
     if fault:
+        yield fault
+        return
+    text = f"{len(arm.joints)} joints with servos, flange"
+    record = verdict("record", [*not_finite(arm), *outside(arm, RANGES, "")], text)
+    yield record
+    if record.status == FAILED:
         return
     if not arm.mounts:
         hint = f"starjax find-mount {name} TOOL WORKSPACE searches one"
@@ -89,6 +95,7 @@ def _hold(arm: Arm, tool: str, workspace: str) -> Check:
 def _task_in(workspace: str) -> str:
     """Returns a built-in task whose arm works in a workspace, or empty."""
     for name in registries.tasks.built_in:
-        if any(slot.workspace == workspace for slot in registries.tasks.get(name).slots):
+        fault, task = attempt(name, lambda name=name: registries.tasks.get(name))
+        if not fault and any(slot.workspace == workspace for slot in task.slots):
             return name
     return ""

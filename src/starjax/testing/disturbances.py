@@ -9,15 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
-from starjax.commands.part_checks.base import NOTE, Check, attempt, verdict
 from starjax.evaluation.disturbances import DISTURBANCES
 from starjax.evaluation.disturbances import base as disturbances
 from starjax.evaluation.disturbances.base import Disturbance
 from starjax.sim import env as envs
+from starjax.sim.tasks.base import CONTROL_HZ
+from starjax.testing.base import NOTE, Check, attempt, verdict
 from starjax.types import Command, Observation
 
 TASK = "reach"
 STEPS = 8  # control steps of an episode that moves down
+HOLD = 40  # control steps at rest, longer than success takes
 DOWN = jnp.array([0.0, 0.0, -0.001])  # m a control step
 TOLERANCE = 1e-5  # m, rad: two compiled programs round differently
 SIDE = 32  # pixels
@@ -30,6 +32,7 @@ FIELDS = (
     "cameras",
     "layout",
     "success",
+    "loose",
     "collided",
 )
 
@@ -57,8 +60,9 @@ def check(name: str, n: int) -> Iterator[Check]:
     plain, none, most = runs
     yield verdict("level 0", _differences(plain, none), "changes nothing")
     yield verdict(f"level {kind.levels[-1]:g}", _not_finite(most), "finite numbers")
+    yield verdict("success", _easier(plain, most), "none without an agent")
     if not kind.image_only and not any(_differences(plain, most)):
-        yield Check("effect", f"none on {STEPS} steps of {TASK} at the highest level", NOTE)
+        yield Check("effect", f"none on {STEPS + HOLD} steps of {TASK} at the highest level", NOTE)
 
 
 def _levels(kind: Disturbance) -> Iterator[str]:
@@ -100,15 +104,16 @@ def _run_all(env: envs.Env, other: envs.Env, name: str, kind: Disturbance) -> tu
 
 
 def _run(env: envs.Env, levels: dict[str, jax.Array] | None) -> tuple[dict[str, Any], Observation]:
-    """Returns the state and the observation after `STEPS` control steps down."""
+    """Returns state and observation after `STEPS` control steps down and `HOLD` at rest."""
     trocar = rcm.Trocar(*(jnp.asarray(field[0]) for field in env.task.trocars))
     state = env.reset(jax.random.key(0), envs.EnvParams(trocar, levels=levels))
 
     def step(state: Any, _: None) -> tuple[Any, None]:
-        pose = state.pose._replace(p=state.pose.p + DOWN)
+        down = jnp.where(state.step < STEPS, DOWN, 0.0)
+        pose = state.pose._replace(p=state.pose.p + down)
         return env.step(state, Command(pose, state.gripper)), None
 
-    state, _ = jax.lax.scan(step, state, None, STEPS)
+    state, _ = jax.lax.scan(step, state, None, STEPS + HOLD)
     return {name: getattr(state, name) for name in FIELDS}, env.observe(state)
 
 
@@ -121,6 +126,14 @@ def _differences(a: Any, b: Any) -> Iterator[str]:
             yield f"{name} has another shape"
         elif not np.allclose(leaf, second[path], 0, TOLERANCE, equal_nan=True):
             yield f"{name} changes"
+
+
+def _easier(plain: Any, most: Any) -> Iterator[str]:
+    """Yields outcomes that an arm reaches under the disturbance alone."""
+    for name in ("success", "loose"):
+        if bool(most[0][name]) and not bool(plain[0][name]):
+            seconds = (STEPS + HOLD) / CONTROL_HZ
+            yield f"{name} at the highest level of an arm that holds for {seconds:.1f} s"
 
 
 def _not_finite(episode: Any) -> Iterator[str]:

@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 
 from starjax import config, errors, rcm
-from starjax.commands.part_checks.base import FAILED, NOTE, Check, attempt, counted, failed, verdict
 from starjax.data import stillness
 from starjax.evaluation import expert as episodes
 from starjax.rollouts.success_quota import MIN_SUCCESS_RATE
@@ -17,9 +16,23 @@ from starjax.sim import contract, coupling, physics, registries, sampling, task_
 from starjax.sim import env as envs
 from starjax.sim.scene import Scene
 from starjax.sim.tasks.base import CONTROL_HZ, SimReadings, Task
+from starjax.testing import task_starts
+from starjax.testing.base import (
+    FAILED,
+    NOTE,
+    Check,
+    attempt,
+    counted,
+    failed,
+    not_finite,
+    outside,
+    verdict,
+)
 from starjax.types import Pose
 
 SEED = 0
+MAX_RCM_ERROR = 1e-3  # m, executed by an expert
+FARTHEST = 1.0  # m from the world's origin to a nominal trocar
 
 
 def check(name: str, n: int) -> Iterator[Check]:
@@ -39,15 +52,32 @@ def check(name: str, n: int) -> Iterator[Check]:
         return
     m = env.scene.mj_model
     yield Check("model", f"{m.ngeom} geoms, {m.nq} coordinates, {m.nu} servos")
-    is_sound = True
-    for result in _functions(env.scene):
-        is_sound &= result.status != FAILED
-        yield result
+    results = [*_functions(env.scene)]
+    if all(result.status != FAILED for result in results):
+        results += [verdict("ranges", ranges(task), "of the record"), *task_starts.check(env)]
+    is_sound = all(result.status != FAILED for result in results)
+    yield from results
     yield verdict("contacts", _untouchable(env.scene), f"{len(task.graspable)} graspable geoms")
     if is_sound:
         yield verdict("draws", _draws(env.scene), "equal with one key, finite")
         for variant in task.experts:
             yield from _expert(env, variant, n)
+
+
+def ranges(task: Task) -> Iterator[str]:
+    """Yields faults of a task's numbers: NaN, and lengths that are not in m."""
+    yield from not_finite(task)
+    for i, slot in enumerate(task.slots):
+        far = float(np.abs(slot.p_world_ref).max())
+        if far > FARTHEST:
+            yield f"slots[{i}].p_world_ref: expected within {FARTHEST:g} m, got {far:g}: mm?"
+    limits = {"radius": (0.0, 0.2), "polar": (0.0, np.pi), "azimuth": (-2 * np.pi, 2 * np.pi)}
+    yield from outside(task.trocars, limits, "m or rad")
+    yield from outside(task, {"floor": (-FARTHEST, FARTHEST)})
+    sizes = {"rot6d": 6, "point": 3}
+    for field in task.fields:
+        if field.kind in sizes and field.size % sizes[field.kind]:
+            yield f"fields: {field.name} of kind {field.kind} has {field.size} numbers"
 
 
 def _functions(scene: Scene) -> Iterator[Check]:
@@ -173,7 +203,9 @@ def _outcomes(env: envs.Env, subject: str, ran: episodes.ExpertEpisodes) -> Iter
     text += f", RCM error up to {figures['rcm_error_mm']['max']:.2g} mm"
     usual = config.DemosConfig().max_steps
     late = int((last.step[success] > max(usual, env.task.least_steps)).sum())
-    if success.mean() < MIN_SUCCESS_RATE:
+    if figures["rcm_error_mm"]["max"] > 1e3 * MAX_RCM_ERROR:
+        yield failed(subject, f"{text}; shafts stay within {1e3 * MAX_RCM_ERROR:g} mm of trocars")
+    elif success.mean() < MIN_SUCCESS_RATE:
         yield failed(subject, f"{text}; collecting needs {MIN_SUCCESS_RATE:.0%}")
     else:
         yield Check(subject, text)
@@ -186,6 +218,7 @@ def _outcomes(env: envs.Env, subject: str, ran: episodes.ExpertEpisodes) -> Iter
             "policy waits there; end phases by events"
         )
         yield failed(subject, text)
+    yield verdict(f"{subject}, goal", task_starts.hidden_goals(env, ran.last), "in the state")
     if not ran.finite.all():
         yield failed(subject, f"{_fields(env, ran)} in {int((~ran.finite).sum())} episodes")
     waiting = ~(success | last.lost | last.invalid)

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from starjax.commands.part_checks.base import Check, attempt, verdict
 from starjax.sim import endoscope_camera, mjcf_parts, registries
 from starjax.sim import scene as scenes
+from starjax.testing.base import Check, attempt, verdict
 
 
 def check(name: str, n: int) -> Iterator[Check]:

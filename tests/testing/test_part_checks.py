@@ -9,16 +9,16 @@ import pytest
 
 from starjax import methods, rcm
 from starjax.commands import presets
-from starjax.commands.part_checks import action_spaces, base, encoders
-from starjax.commands.part_checks import methods as method_checks
-from starjax.commands.part_checks import policies as policy_checks
-from starjax.commands.part_checks import presets as preset_checks
-from starjax.commands.part_checks import tools as tool_checks
 from starjax.learners import ENCODERS
 from starjax.models.encoders import Trunk
 from starjax.policies.external import POLICIES, ExternalPolicy
 from starjax.rcm import actions
 from starjax.sim import registries
+from starjax.testing import action_spaces, base, encoders
+from starjax.testing import methods as method_checks
+from starjax.testing import policies as policy_checks
+from starjax.testing import presets as preset_checks
+from starjax.testing import tools as tool_checks
 
 
 def faults(found):

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
-from starjax.commands.part_checks.base import FAILED, Check, attempt, verdict
 from starjax.rcm.actions import ACTION_SPACES, ActionSpace
 from starjax.runtime import user_code
 from starjax.sim import registries
+from starjax.testing.base import FAILED, Check, attempt, verdict
 from starjax.types import Pose
 
 COUNT = 256  # poses

@@ -5,11 +5,15 @@ from typing import Any
 
 import numpy as np
 
-from starjax.commands.part_checks.base import FAILED, NOTE, Check, attempt, verdict
 from starjax.deploy import external, served
 from starjax.policies.external import POLICIES
+from starjax.testing.base import FAILED, NOTE, Check, attempt, failed, verdict
 
 FAR = 0.05  # m from the tip to the first command, beyond a step of any tool
+MOVED = 0.01  # m, by which the tips of another observation are away
+FARTHEST = 0.5  # m from the tip; no command of a policy in m is farther
+UNIT = 1e-2  # by which a quaternion's length, or a gripper, may be off
+TURNED = 1.0  # rad that a first command may turn the tip by
 IMAGE, STATE = "observation/image", "observation/state"
 
 
@@ -59,12 +63,17 @@ def check(name: str, n: int) -> Iterator[Check]:
     yield result
     if result.status == FAILED:
         return
-    first, *_, again = plans
+    first, moved, dark, again = plans
+    tips = np.reshape(request[STATE], (-1, 8))
+    yield verdict("command", _commanded(first[0].reshape(-1, 8), tips), "a pose near the tip's")
+    if np.array_equal(first, moved) and np.array_equal(first, dark):
+        yield failed("input", f"the plan is the same with tips {1e3 * MOVED:g} mm away")
+    elif IMAGE in request and np.array_equal(first, dark):
+        yield Check("input", "the plan is the same with a black image", NOTE)
     if not np.array_equal(first, again):
         text = "one observation has several plans: draws or memory, which episodes share"
         yield Check("repeatable", text, NOTE)
-    tip = np.reshape(request[STATE], (-1, 8))[:, :3]
-    away = float(np.linalg.norm(first[0].reshape(-1, 8)[:, :3] - tip, axis=-1).max())
+    away = float(np.linalg.norm(first[0].reshape(-1, 8)[:, :3] - tips[:, :3], axis=-1).max())
     if away > FAR:
         yield Check("first command", f"{1e3 * away:.0f} mm from the tip", NOTE)
 
@@ -81,11 +90,38 @@ def _changed(rng: np.random.Generator, name: str, value: Any) -> Any:
     """Returns an entry of another observation: tips some mm away, another image."""
     if name == STATE:
         rows = np.array(value).reshape(-1, 8)
-        rows[:, :3] += rng.uniform(-0.01, 0.01, (len(rows), 3))
+        rows[:, :3] += rng.uniform(-MOVED, MOVED, (len(rows), 3))
         return rows.reshape(np.shape(value)).astype(np.float32)
     if name == IMAGE:
         return rng.integers(0, 256, np.shape(value), np.uint8)
     return value
+
+
+def _commanded(rows: np.ndarray, tips: np.ndarray) -> Iterator[str]:
+    """Yields faults of first commands `[A, 8]`, compared with the measured tips `[A, 8]`."""
+    away = float(np.linalg.norm(rows[:, :3] - tips[:, :3], axis=-1).max())
+    if away > FARTHEST:
+        near = float(np.linalg.norm(1e-3 * rows[:, :3] - tips[:, :3], axis=-1).max())
+        yield f"{away:.3g} m from the tip" + ": are positions in mm?" * (near < FARTHEST)
+    lengths = np.linalg.norm(rows[:, 3:7], axis=-1)
+    if (off := float(np.abs(lengths - 1.0).max())) > UNIT:
+        yield f"quaternions of a length that is off by {off:.2g}"
+        return
+    angle, other = (_largest_turn(q, tips[:, 3:7]) for q in (rows[:, 3:7], _from_wxyz(rows)))
+    if angle > TURNED:
+        why = f", by {other:.2f} as wxyz: xyzw is expected" * (other < TURNED)
+        yield f"the first command turns the tip by {angle:.2f} rad{why}"
+    if (largest := float(np.abs(rows[:, 7]).max())) > 1.0 + UNIT:
+        yield f"a gripper at {largest:.3g}, expected -1 to 1"
+
+
+def _from_wxyz(rows: np.ndarray) -> np.ndarray:
+    return rows[:, [4, 5, 6, 3]]
+
+
+def _largest_turn(a: np.ndarray, b: np.ndarray) -> float:
+    """Returns the largest angle in rad between quaternions `[A, 4]`."""
+    return float(2.0 * np.arccos(np.clip(np.abs(np.sum(a * b, -1)), 0.0, 1.0)).max())
 
 
 def _faults(plans: list[np.ndarray]) -> Iterator[str]:

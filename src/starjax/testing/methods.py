@@ -6,11 +6,11 @@ import jax
 
 from starjax import rcm
 from starjax.commands import presets
-from starjax.commands.part_checks.base import NOTE, Check, attempt, verdict
 from starjax.methods import METHODS, Method
 from starjax.policies import policy
 from starjax.runtime import user_code
 from starjax.sim import registries, scene, wrists
+from starjax.testing.base import NOTE, Check, attempt, verdict
 
 TASKS = ("reach", "peg_transfer_bimanual")  # tasks of one arm and of two
 WRISTED = "needle_driver"  # tool of methods that move a wrist

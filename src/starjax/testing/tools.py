@@ -7,12 +7,21 @@ import mujoco
 import numpy as np
 
 from starjax import rcm
-from starjax.commands.part_checks.base import Check, attempt, verdict
 from starjax.sim import mjcf_parts, registries
 from starjax.sim.tools.base import Tool
+from starjax.testing.base import Check, attempt, not_finite, outside, verdict
 
 BEND = (0.5, -0.4)  # rad, pitch and yaw of a bent wrist
 NEAR, NEAR_TURN = 1e-5, 1e-4  # m, and of a rotation's entries
+RANGES = {
+    "closed": (-2.0, 2.0),
+    "open": (-2.0, 2.0),
+    "shaft_radius": (1e-4, 0.02),
+    "shaft_end": (-0.1, 0.1),
+    "pad_end": (-0.05, 0.05),
+    "shaft_reach": (1e-3, 1.0),
+    "palm_radius": (0.0, 0.05),
+}  # m, or rad of jaws that turn
 OBJECT_BITS = 4  # contype of objects that can be grasped, see mjcf/README.md
 
 
@@ -23,8 +32,8 @@ def check(name: str, n: int) -> Iterator[Check]:
         yield fault
         return
     tool, m = read
-    missing = list(_names(tool, m))
-    yield verdict("record", iter(missing), f"{m.ngeom} geoms, site {tool.tcp}")
+    missing = [*_names(tool, m), *not_finite(tool), *outside(tool, RANGES)]
+    yield verdict("record", missing, f"{m.ngeom} geoms, site {tool.tcp}")
     fault, _ = attempt("names", lambda: mjcf_parts.ids(f"tool {name}", m, "site", [tool.tcp]))
     if not fault:
         yield verdict("tip frame", _axis(tool, m), "z points away from the robot")
@@ -53,9 +62,6 @@ def _names(tool: Tool, m: mujoco.MjModel) -> Iterator[str]:
             fault, _ = attempt("", lambda k=kind, n=name: mjcf_parts.ids("MJCF", m, k, [n]))
             if fault:
                 yield f"no {kind} {name}"
-    for field in ("shaft_radius", "shaft_reach"):
-        if not getattr(tool, field) > 0:
-            yield f"{field}: expected more than 0, got {getattr(tool, field)}"
 
 
 def _wrist(tool: Tool, m: mujoco.MjModel) -> Iterator[str]:

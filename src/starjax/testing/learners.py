@@ -1,0 +1,160 @@
+"""Checks of a learner: options, and shapes, gradients and draws of a small model of it."""
+
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from starjax import config
+from starjax.commands import presets
+from starjax.learners import LEARNERS
+from starjax.policies import learner_contract
+from starjax.policies.sequences import Condition, SequenceModel, Sizes
+from starjax.testing.base import Check, attempt, failed, verdict
+
+BATCH = 3
+# With and without images and a trocar.
+SIZES = {
+    "of the state": Sizes(horizon=16, action=5, obs_horizon=2, vision=0, state=8, trocar=0),
+    "of images": Sizes(horizon=16, action=10, obs_horizon=2, vision=12, state=8, trocar=7),
+}
+STEPS = 60  # steps of a short training
+LEARNING_RATE = 1e-3
+TARGET = 0.5  # value of every number of the learned sequences
+AWAY = 0.1  # by which means of samples may leave the target: diffusion is slow
+SEEN = 1e-6  # least change of a sample
+TOLERANCE = 1e-4  # between a sample in one batch and in another
+
+
+def check(name: str, n: int) -> Iterator[Check]:
+    """Yields the checks of a learner with its default options; `n` is not used."""
+    fault, policy = attempt("options", lambda: _settings(name))
+    if fault:
+        yield fault
+        return
+    yield Check("options", ", ".join(vars(policy.options)) or "none")
+    for text, sizes in SIZES.items():
+        fault, model = attempt(text, lambda s=sizes: learner_contract.make(policy, s))
+        yield fault or Check(f"shapes, {text}", "of init, loss and sample")
+        if not fault:
+            yield from _values(text, model, sizes)
+
+
+def _settings(name: str) -> config.PolicyConfig:
+    small = presets.PRESETS["smoke"].policy  # its options are those of a small network
+    policy = config.with_learner(small, name)
+    LEARNERS.get(name).check(policy.options, policy)
+    return policy
+
+
+def _values(text: str, model: SequenceModel, sizes: Sizes) -> Iterator[Check]:
+    """Yields checks of numbers: loss, gradients, samples, and a short training with images."""
+    params = jax.jit(model.init)(jax.random.key(0))
+    condition = learner_contract.condition(sizes, BATCH, jax.random.key(1))
+    x0 = jax.random.uniform(jax.random.key(2), (BATCH, sizes.horizon, sizes.action), minval=-1)
+    prepare, sample = jax.jit(model.prepare), jax.jit(model.sample)
+    learned = jax.jit(
+        jax.value_and_grad(lambda params, given: model.loss(params, condition, given)[0])
+    )
+    loss, gradient = learned(params, prepare(jax.random.key(3), x0))
+    still = [
+        jax.tree_util.keystr(path)
+        for path, leaf in jax.tree_util.tree_leaves_with_path(gradient)
+        if not np.isfinite(leaf).all()
+    ]
+    if not np.isfinite(loss):
+        yield failed(f"loss, {text}", f"not finite: {loss}")
+    flat = all(not np.any(leaf) for leaf in jax.tree.leaves(gradient))
+    faults = [f"not finite at {path}" for path in still] + ["0 everywhere"] * flat
+    yield verdict(f"gradient, {text}", faults, f"finite, of a loss of {float(loss):.3g}")
+    keys = jax.random.split(jax.random.key(4), BATCH)
+
+    def drawn(params: Any, condition: Condition) -> np.ndarray:
+        return np.asarray(sample(model.prepare_for_inference(params), keys, condition, None))
+
+    yield verdict(
+        f"samples, {text}", _samples(model, sample, params, condition, keys), "follow their keys"
+    )
+    if not sizes.vision or not np.isfinite(loss) or faults:
+        return
+    target = jnp.full(x0.shape, TARGET)
+    given = [prepare(key, target) for key in jax.random.split(jax.random.key(5), STEPS)]
+    trained, losses = _trained(learned, params, given)
+    other = float(learned(trained, prepare(jax.random.key(5), -target))[0])
+    own = float(learned(trained, prepare(jax.random.key(5), target))[0])
+    # Means: draws of a generator differ by more than a short training moves them.
+    off = [abs(float(drawn(p, condition).mean()) - TARGET) for p in (params, trained)]
+    figures = f"samples {off[0]:.2g} off before, {off[1]:.2g} after {STEPS} steps"
+    faults = list(_unlearned(losses, off))
+    if not other > own:
+        faults.append(f"the loss is {own:.3g} for learned sequences and {other:.3g} for others")
+    yield verdict(f"training, {text}", faults, figures)
+    blind = _blind(functools.partial(drawn, trained), condition)
+    yield verdict(f"input, {text}", blind, "samples follow it")
+
+
+def _trained(
+    learned: Callable[..., Any], params: Any, given: Sequence[Any]
+) -> tuple[Any, np.ndarray]:
+    """Returns parameters after a short training, and the losses of its steps."""
+    optimiser = optax.adam(LEARNING_RATE)
+
+    @jax.jit
+    def update(params: Any, state: Any, gradient: Any) -> tuple[Any, Any]:
+        updates, state = optimiser.update(gradient, state, params)
+        return optax.apply_updates(params, updates), state
+
+    state, losses = optimiser.init(params), []
+    for each in given:
+        loss, gradient = learned(params, each)
+        params, state = update(params, state, gradient)
+        losses.append(float(loss))
+    return params, np.array(losses)
+
+
+def _unlearned(losses: np.ndarray, off: Sequence[float]) -> Iterator[str]:
+    """Yields faults of a training: the loss does not fall, or the samples' error does not."""
+    tenth = len(losses) // 10
+    first, last = losses[:tenth].mean(), losses[-tenth:].mean()
+    if not last < first:
+        yield f"the loss goes from {first:.3g} to {last:.3g} in {STEPS} steps"
+    if not off[1] < off[0] + AWAY:
+        yield f"samples are {off[1]:.3g} off on average after {STEPS} steps, {off[0]:.3g} before"
+
+
+def _blind(drawn: Callable[[Condition], np.ndarray], condition: Condition) -> Iterator[str]:
+    """Yields the parts of a condition that no sample follows."""
+    before = drawn(condition)
+    for name, part in condition._asdict().items():
+        if part is not None and part.size:
+            moved = float(np.abs(drawn(condition._replace(**{name: part + 1.0})) - before).max())
+            if moved < SEEN:
+                yield f"other {name} changes samples by {moved:.2g}, expected {SEEN:g} or more"
+
+
+def _samples(
+    model: SequenceModel,
+    sample: Callable[..., jax.Array],
+    params: Any,
+    condition: Condition,
+    keys: jax.Array,
+) -> Iterator[str]:
+    ready = model.prepare_for_inference(params)
+    first = np.asarray(sample(ready, keys, condition, None))
+    if not np.isfinite(first).all():
+        yield "not finite"
+        return
+    if np.abs(first).max() > 1.0:
+        yield f"expected within [-1, 1] without a reach, got {np.abs(first).max():.3g}"
+    reach = jnp.stack([jnp.full(first.shape[-1], -0.5), jnp.full(first.shape[-1], 0.5)])
+    within = np.abs(np.asarray(sample(ready, keys, condition, reach))).max()
+    if within > 0.5:
+        yield f"expected within a reach of 0.5, got {within:.3g}"
+    turned = jax.tree.map(lambda x: x[::-1], condition)
+    other = np.asarray(sample(ready, keys[::-1], turned, None))[::-1]
+    if np.abs(other - first).max() > TOLERANCE:
+        yield "a sample depends on more than its own key and condition"
