@@ -458,3 +458,14 @@ def test_a_broken_format_leaves_the_others(tmp_path, monkeypatch):
     assert base.detect(tmp_path / "d") == "lerobot"
     with pytest.warns(UserWarning, match="skipped"), pytest.raises(errors.UsageError):
         base.detect(tmp_path)  # of no format: the broken ones are asked too
+
+
+def test_a_format_of_two_packages_fails_alone(tmp_path, monkeypatch):
+    value = "starjax.addons.formats.csv:FORMAT"
+    again = importlib.metadata.EntryPoint("csv", value, "starjax.formats")
+    monkeypatch.setattr(type(base.FORMATS), "_entries", lambda self: [again])
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "info.json").touch()
+    assert base.detect(tmp_path) == "lerobot"
+    with pytest.warns(UserWarning, match="csv is skipped"):
+        assert {"lerobot", "zarr", "robomimic"} <= set(base.writable())
