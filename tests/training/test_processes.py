@@ -206,6 +206,7 @@ def start_lone(latest: int) -> subprocess.Popen:
 
 def test_a_process_that_waits_for_others_is_ended_by_a_signal():
     with start_lone(latest=60) as lone:
+        assert lone.stderr
         line = lone.stderr.readline()
         lone.send_signal(signal.SIGTERM)
         assert "waits for 2 processes" in line and lone.wait(30) == 130

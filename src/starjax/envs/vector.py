@@ -95,7 +95,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
             raise gymnasium.error.Error(str(error)) from None
         seeds = self._seeds(seed)
         check_options(options, "reset_mask")
-        super().reset(seed=seeds[0] if np.ndim(seed) == 0 else None)
+        super().reset(seed=seeds[0] if isinstance(seed, int | np.integer) else None)
         which = np.ones(self.num_envs, bool)
         if options and "reset_mask" in options:
             which = self._mask(options["reset_mask"])
