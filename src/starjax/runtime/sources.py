@@ -70,7 +70,7 @@ def refuse_other_code(where: Path, before: Mapping[str, Any], now: Mapping[str, 
       where: file of `before`.
       before, now: contents with the values of `record`; older ones lack them.
     """
-    for name, digest in now["source"].items():
+    for name, digest in now.get("source", {}).items():
         known = before.get("source", {}).get(name, digest)
         version = before.get("parts", {}).get(name)
         if known != digest and version == now["parts"][name]:
