@@ -3,11 +3,14 @@
     python benchmarks/bench_rcm.py [--batch 100000] [--tiny]
 
 numpy is the same mathematics vectorised without the guards that make `starjax.rcm` total; scipy
-is the usual loop over single poses with `Rotation` objects.
+is the usual loop over single poses with `Rotation` objects. Last, calls with one pose as in a
+robot's loop, in CPU time: by operations, as the map is, under `jax.jit`, and numpy.
 """
 
 import argparse
 import functools
+import inspect
+import time
 from collections.abc import Callable
 
 import _timing
@@ -71,7 +74,41 @@ def main() -> None:
                 f"{scipy_rate / 1e3:7.1f} {rate / numpy_rate:8.1f} {rate / scipy_rate:8.0f} "
                 f"{time_ours.compile_s:10.2f} {gap:8.1e}"
             )
-    _timing.report("rcm", {"batch": batch, "dtype": "float32", "results": rows}, asked.tiny)
+    called = one_call(3 if asked.tiny else 200)
+    results = {"batch": batch, "dtype": "float32", "results": rows, "one_call_cpu_ms": called}
+    _timing.report("rcm", results, asked.tiny)
+
+
+def one_call(repeats: int) -> dict[str, dict[str, float]]:
+    """CPU ms of one call with one pose: three maps, four ways."""
+    trocar = jax.tree.map(lambda field: field[:1], rcm.TROCARS)
+    pose = sample_poses(trocar, 1)
+    where = np.asarray(rcm.trocar_position(trocar, P_WORLD_REF))
+    action = np.asarray(rcm.ACTION_SPACES["rcm4"].encode(pose, trocar, P_WORLD_REF))
+    wide = jax.tree.map(np.float64, trocar)
+    maps = {
+        "decode_rcm4": (rcm.ACTION_SPACES["rcm4"].decode, (action, trocar, P_WORLD_REF)),
+        "project": (rcm.project, (pose, where)),
+        "angles_through": (rcm.angles_through, (rcm.LARGE_NEEDLE_DRIVER, pose, where)),
+    }
+    rows = {}
+    for name, (call, inputs) in maps.items():
+        fixed = (0,) if name == "angles_through" else ()
+        jitted = jax.jit(call, static_argnums=fixed)
+        ways = {"called": call, "jitted": jitted, "eager": inspect.unwrap(call)}
+        rows[name] = {way: cpu_ms(each, inputs, repeats) for way, each in ways.items()}
+        print(name, *(f"{way} {ms:.3f} ms" for way, ms in rows[name].items()))
+    peer = functools.partial(numpy_decode, "rcm4", np.float64(action), wide, P_WORLD_REF)
+    rows["decode_rcm4"]["numpy"] = cpu_ms(peer, (), repeats)
+    return rows
+
+
+def cpu_ms(call: Callable, inputs: tuple, repeats: int) -> float:
+    jax.block_until_ready(call(*inputs))
+    begun = time.process_time()
+    for _ in range(repeats):
+        jax.block_until_ready(call(*inputs))
+    return 1e3 * (time.process_time() - begun) / repeats
 
 
 def framed(way: Callable) -> Callable:

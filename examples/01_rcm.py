@@ -1,6 +1,7 @@
 """Turns any numbers into tool poses whose shaft passes through the trocar.
 
-`starjax.rcm` needs jax and numpy only. Its functions broadcast, compile and have finite gradients.
+`starjax.rcm` needs jax and numpy only. Its functions broadcast, have finite gradients, and
+run compiled, also when they are called with arrays as in a robot's loop.
 """
 
 import jax

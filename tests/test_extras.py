@@ -34,7 +34,7 @@ def test_rcm_needs_no_extra():
 def test_extras_bring_what_their_names_say(extra):
     """The requirements of pyproject.toml, by the names that Python imports them by."""
     imported = importlib.metadata.packages_distributions()
-    wanted = [re.split(r"[<>=\[]", text)[0] for text in PROJECT["optional-dependencies"][extra]]
+    wanted = [re.split(r"[<>=;\[]", text)[0] for text in PROJECT["optional-dependencies"][extra]]
     brought = {
         name
         for name, dists in imported.items()
@@ -48,7 +48,11 @@ def test_extras_bring_what_their_names_say(extra):
 def test_all_has_every_extra_but_trackers():
     (everything,) = PROJECT["optional-dependencies"]["all"]
     names = everything.removeprefix("starjax[").removesuffix("]")
-    assert set(names.split(",")) == set(extras.PACKAGES) - {"tensorboard", "wandb"}  # one's choice
+    assert set(names.split(",")) == set(extras.PACKAGES) - {
+        "ros2",
+        "tensorboard",
+        "wandb",
+    }  # one's choice
 
 
 @pytest.mark.parametrize("command", cli.COMMANDS)

@@ -15,6 +15,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "video": ("imageio_ffmpeg",),
     "formats": ("PIL", "av", "h5py", "pyarrow", "zarr"),
     "ros": ("rosbags",),
+    "ros2": ("cyclonedds",),
     "gym": ("gymnasium",),
     "serve": ("PIL", "filelock", "flax", "msgpack", "msgspec", "safetensors", "websockets"),
     "viewer": ("viser",),

@@ -13,6 +13,7 @@ import pytest
 from starjax import cli, errors, methods, rcm
 from starjax.addons.formats import mapping
 from starjax.addons.formats.base import FORMATS
+from starjax.addons.robots import robot_file
 from starjax.commands import presets
 from starjax.evaluation.disturbances import DISTURBANCES
 from starjax.learners import LEARNERS
@@ -79,7 +80,7 @@ def test_programs_run(page, tmp_path, monkeypatch):
 
 
 def test_configurations_are_read(page, tmp_path):
-    """Entry points are of groups that are looked at; anything else is a mapping of a dataset."""
+    """Entry points are of known groups, an arm is a robot, anything else maps a dataset."""
     kinds = (registries.tasks, registries.arms, registries.tools, registries.workspaces, LEARNERS)
     groups = {f"starjax.{one.kind}s" for one in (*kinds, FORMATS, DISTURBANCES)}
     rows = (methods.METHODS, rcm.ACTION_SPACES, presets.PRESETS)
@@ -91,6 +92,9 @@ def test_configurations_are_read(page, tmp_path):
         found = tomllib.loads(block)
         if "project" in found:
             assert found["project"]["entry-points"].keys() <= groups
+        elif "arm" in found:
+            (tmp_path / "robot.toml").write_text(block)
+            assert robot_file.read(tmp_path / "robot.toml").cameras
         else:
             (tmp_path / "map.toml").write_text(block)
             assert mapping.load(tmp_path / "map.toml").task in registries.tasks.names()

@@ -1,0 +1,109 @@
+"""Topics of ROS 2 over DDS: newest messages, other writers, networks. Polled, without listeners."""
+
+import os
+import time
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+from cyclonedds.core import Policy, Qos
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.internal import InvalidSample
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+from starjax.addons.robots.messages import ros_name
+from starjax.addons.robots.robot_file import Network
+
+_BLOCKING = duration(milliseconds=20)  # of a reliable writer with a full reader
+_DEPTHS = {"default": 10, "servo": 1, "sensor": 5, "latched": 1}
+_URI = "CYCLONEDDS_URI"  # a user's own configuration replaces ours
+_AT_ONCE = 20  # messages of a topic that a poll reads
+
+
+class Bus:
+    """A participant of DDS with its readers and writers.
+
+    Attributes:
+      newest: topic -> the newest message. came: topic -> s, `time.time()` of its arrival.
+    """
+
+    def __init__(self, network: Network) -> None:
+        self._domain = None if _URI in os.environ else Domain(network.domain, _xml(network))
+        self._participant = DomainParticipant(network.domain)
+        self._found = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
+        self._others: dict[Any, tuple[str, str]] = {}  # key -> topic and type of another's writer
+        self._readers: dict[str, DataReader] = {}
+        self.newest: dict[str, Any] = {}
+        self.came: dict[str, float] = {}
+
+    def read(self, topic: str, kind: type, profile: str = "default") -> None:
+        """Subscribes; `poll` keeps the newest message."""
+        where = Topic(self._participant, f"rt{topic}", kind)
+        # A reader without promises matches every writer; kept states need both to keep them.
+        quality = _quality("latched" if profile == "latched" else "sensor", depth=1)
+        self._readers[topic] = DataReader(self._participant, where, qos=quality)
+
+    def writer(self, topic: str, kind: type, profile: str = "default") -> DataWriter:
+        """Opens a writer of a profile: default, servo, sensor or latched."""
+        where = Topic(self._participant, f"rt{topic}", kind)
+        return DataWriter(self._participant, where, qos=_quality(profile, _DEPTHS[profile]))
+
+    def poll(self) -> list[str]:
+        """Reads all topics; returns those with a new message."""
+        fresh = []
+        for topic, reader in self._readers.items():
+            # A writer that ended leaves a sample without fields.
+            some = [x for x in reader.take(_AT_ONCE) if not isinstance(x, InvalidSample)]
+            if some:
+                self.newest[topic], self.came[topic] = some[-1], time.time()
+                fresh.append(topic)
+        for one in self._found.take(100):
+            if not one.sample_info.valid_data:
+                self._others.pop(one.key, None)
+            elif one.participant_key != self._participant.guid:
+                self._others[one.key] = (one.topic_name.removeprefix("rt"), one.type_name)
+        return fresh
+
+    def writers(self, topic: str) -> list[str]:
+        """Returns the types of other participants' writers on a topic, as ROS names them.
+
+        A writer that was killed counts until its lease of 10 s is over.
+        """
+        return [ros_name(kind) for where, kind in self._others.values() if where == topic]
+
+    def topics(self) -> list[str]:
+        """Returns the topics of other participants' writers."""
+        return sorted({where for where, _ in self._others.values()})
+
+
+def _xml(network: Network) -> str:
+    """Returns the configuration of Cyclone DDS."""
+    peers = ["127.0.0.1"] if network.interface == "lo" else list(network.peers)
+    general = discovery = ""
+    if network.interface:
+        name = quoteattr(network.interface)
+        general = f"<Interfaces><NetworkInterface name={name}/></Interfaces>"
+    if peers:
+        general += "<AllowMulticast>false</AllowMulticast>"
+        listed = "".join(f"<Peer address={quoteattr(peer)}/>" for peer in peers)
+        discovery = (
+            f"<Peers>{listed}</Peers><ParticipantIndex>auto</ParticipantIndex>"
+            "<MaxAutoParticipantIndex>30</MaxAutoParticipantIndex>"
+        )
+    return (
+        f"<CycloneDDS><Domain><General>{general}</General><Discovery>{discovery}</Discovery>"
+        "<Internal><SocketReceiveBufferSize max='4MB'/></Internal></Domain></CycloneDDS>"
+    )
+
+
+def _quality(profile: str, depth: int) -> Qos:
+    is_best_effort = profile == "sensor"
+    return Qos(
+        Policy.Reliability.BestEffort if is_best_effort else Policy.Reliability.Reliable(_BLOCKING),
+        Policy.History.KeepLast(depth),
+        Policy.Durability.TransientLocal if profile == "latched" else Policy.Durability.Volatile,
+        Policy.DataRepresentation(use_cdrv0_representation=True),
+    )

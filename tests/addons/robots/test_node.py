@@ -1,0 +1,293 @@
+"""A policy's node and a robot in another process, over DDS on this computer."""
+
+import contextlib
+import dataclasses
+import json
+import os
+import pathlib
+import subprocess
+import sys
+import time
+
+import mistakes
+import numpy as np
+import pytest
+
+pytest.importorskip("cyclonedds")
+
+from starjax import deploy, rcm
+from starjax.addons.robots import (
+    arm,
+    between,
+    bus,
+    node,
+    psm,
+    robot_file,
+    sim_arm,
+    topic_table,
+)
+from starjax.deploy.connection import Reply
+
+DOMAIN = 60 + int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:])
+BASE = np.array([0.014, 0.014, 0.153])
+HORIZON, EXECUTE = 16, 8
+FILE = f"""
+[arm]
+namespace = "/PSM1"
+position = {BASE.tolist()}
+command = "COMMAND"
+[trocar]
+topic = "/trocar"
+[camera.camera]
+topic = "/camera/image_raw"
+[limits]
+speed = 0.05
+turn_rate = 1.0
+stale_s = 1.0
+following_m = 0.01
+[network]
+domain = {DOMAIN}
+interface = "lo"
+"""
+
+
+ASKS = {
+    "moments": 1,
+    "arms": [],
+    "p_world_ref": [0.0, 0.0, 0.15],
+    "keeps_to_manifold": True,
+    "image_size": 32,
+    "cameras": ["camera"],
+    "state_size": 0,
+}
+GREETING = {"control_hz": 30.0, "horizon": HORIZON, "execute": EXECUTE, "asks": ASKS}
+
+
+class Circle:
+    """A policy in the place of a connection: the tip goes round, the tool straight through."""
+
+    metadata = GREETING
+    is_up, connections = True, 1
+
+    def __init__(self, *_):
+        self.reply, self.phase, self.middle = None, 0, None
+
+    def send(self, value):
+        tip, R = value["p"][-1], value["R"][-1]
+        if self.middle is None or np.linalg.norm(tip - self.middle) > 0.02:
+            self.middle, self.phase = tip - [0.01, 0.0, 0.0], 0
+        angle = 2 * np.pi / 120 * (self.phase + np.arange(1, HORIZON + 1))
+        ring = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
+        tips = (self.middle + 0.01 * ring).astype(np.float32)
+        roll = float(rcm.roll_of(R))
+        turned = rcm.rotation_from_axis_roll(tips - np.float32(BASE), np.full(HORIZON, roll))
+        R = np.asarray(turned, np.float32)
+        self.reply = {"R": R, "p": tips, "gripper": np.full(HORIZON, 0.2, np.float32)}
+        self.phase += EXECUTE
+
+    def poll(self):
+        reply, self.reply = self.reply, None
+        return None if reply is None else Reply(reply)
+
+    def close(self):
+        pass
+
+
+class Process:
+    """A robot in another process."""
+
+    def __init__(self, yaw=0.0):
+        path = pathlib.Path(__file__).with_name("robot_process.py")
+        argv = [sys.executable, str(path), str(DOMAIN), str(yaw)]
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+        self.process = subprocess.Popen(argv, **pipes)
+        assert self.process.stdout.readline() == "ready\n"
+
+    def say(self, line):
+        self.process.stdin.write(f"{line}\n")
+        self.process.stdin.flush()
+
+    def end(self):
+        self.say("end")
+        return json.loads(self.process.communicate(timeout=30)[0])
+
+    def kill(self):
+        self.process.kill()
+        self.process.wait()
+
+
+@contextlib.contextmanager
+def robot(yaw=0.0):
+    process = Process(yaw)
+    try:
+        yield process
+    finally:
+        process.kill()
+
+
+@pytest.fixture(scope="module")
+def own_bus():
+    return bus.Bus(robot_file.Network(DOMAIN, "lo"))
+
+
+def file_of(tmp_path, command="servo_jp", **changed):
+    text = FILE.replace("COMMAND", command)
+    for old, new in changed.items():
+        text = text.replace(f"[{old}]", f"[{old}]\n{new}")
+    path = tmp_path / "robot.toml"
+    path.write_text(text)
+    return robot_file.read(path)
+
+
+@contextlib.contextmanager
+def made(own_bus, file):
+    """The arm's side that is ready, and its client."""
+    limits = deploy.Limits(file.limits.speed, file.limits.turn_rate)
+    options = {"connect": Circle, "limits": limits, "tolerances": node.tolerances(file)}
+    with deploy.Client("", file.p_world_trocar, **options) as client:
+        one = arm.CrtkArm(own_bus, file, 32)
+        yield one, client, topic_table.look(one, 0.3, 20.0, lambda: False)
+
+
+def later(process, line, after=0.5):
+    """A stop condition that spoils the robot after a while, and then lets the run go on."""
+    begun = time.monotonic()
+    said = []
+
+    def should_stop():
+        if not said and time.monotonic() - begun > after:
+            said.append(process.say(line))
+        return False
+
+    return should_stop
+
+
+@pytest.mark.parametrize("command", ["servo_jp", "servo_cp"])
+def test_two_processes_move_a_tip_round_over_topics(own_bus, tmp_path, command):
+    with robot() as process, made(own_bus, file_of(tmp_path, command)) as (one, client, rows):
+        assert topic_table.problems(rows) == [] and node.doubts(one, client) == []
+        report = node.run(one, client, 2.0)
+        assert report.fault == "" and report.silent == 0 and report.plans >= 5
+        assert one.sent == 4 * report.steps  # 120 Hz
+        told = process.end()
+    assert told["commands"] > 0.2 * one.sent  # newer ones replace those that are late
+    assert told["moved"] < 0.005
+    tip = psm.tip_of(np.array(told["q"]), psm.LARGE_NEEDLE_DRIVER).p
+    start = psm.tip_of(sim_arm.HOME, psm.LARGE_NEEDLE_DRIVER).p
+    assert np.linalg.norm(tip - start) > 0.015  # half round a circle of 10 mm
+
+
+@pytest.mark.parametrize(
+    ("line", "name"),
+    [
+        ("freeze", "stale pose"),
+        ("state PAUSED", "state"),
+        ("trocar 0.004 0 0", "moved trocar"),
+        ("rival", "commander"),
+    ],
+)
+def test_a_doubt_silences_the_node(own_bus, tmp_path, line, name):
+    with robot() as process, made(own_bus, file_of(tmp_path)) as (one, client, _):
+        report = node.run(one, client, 8.0, should_stop=later(process, line))
+        assert report.fault.startswith(name), report
+        sent = one.sent
+        assert 0 < sent < 8 * 120 * 0.6
+        told = process.end()
+    assert told["commands"] <= sent and told["moved"] < 0.005
+
+
+def test_a_robot_that_is_killed_and_back_elsewhere_is_not_pulled(own_bus, tmp_path):
+    with robot() as first, made(own_bus, file_of(tmp_path)) as (one, client, _):
+        stop = iter([False] * 20 + [True])
+        node.run(one, client, 5.0, should_stop=lambda: next(stop))
+        first.kill()
+        with robot(yaw=0.25) as second:
+            report = node.run(one, client, 5.0)  # until the first doubt: nobody confirms
+            assert report.fault and client.report.silent
+            deadline = time.monotonic() + 20.0
+            while node.doubts(one, client) and time.monotonic() < deadline:
+                one.poll()
+                time.sleep(0.01)
+            client.restart(one.measure())
+            node.run(one, client, 2.0)
+            told = second.end()
+    assert told["commands"] > 50 and told["moved"] < 0.01
+
+
+def test_a_dry_run_sends_nothing(own_bus, tmp_path):
+    with robot() as process, made(own_bus, file_of(tmp_path)) as (one, _, _):
+        tolerances = node.tolerances(one.file, is_dry=True)
+        options = {"connect": Circle, "tolerances": tolerances}
+        with deploy.Client("", one.file.p_world_trocar, **options) as client:
+            report = node.run(one, client, 1.0, is_dry=True)
+        assert report.plans >= 2 and one.sent == 0 and process.end()["commands"] == 0
+
+
+def test_a_wrong_instrument_is_found_before_anything_is_sent(own_bus, tmp_path):
+    file = file_of(tmp_path, arm='instrument = "prograsp"')
+    with robot() as process, made(own_bus, file) as (one, client, _):
+        assert "frames" in [doubt.name for doubt in node.doubts(one, client)]
+        assert node.run(one, client, 1.0).fault.startswith("frames")
+        assert one.sent == 0 and process.end()["commands"] == 0
+
+
+def test_a_wrong_base_is_found_by_the_setpoint(own_bus, tmp_path):
+    """Measurements agree in any base; the robot's own setpoint does not."""
+    with robot() as process, made(own_bus, file_of(tmp_path)) as (one, client, _):
+        command = client.step(one.measure())
+        assert one.check_first(command) == []
+        aside = command._replace(pose=command.pose._replace(p=command.pose.p + 0.01))
+        (doubt,) = one.check_first(aside)
+        assert doubt.name == "first command" and one.sent == 0
+        process.end()
+
+
+def test_a_topic_that_nobody_writes_is_named(own_bus, tmp_path):
+    file = file_of(tmp_path)
+    absent = dataclasses.replace(file, arm=dataclasses.replace(file.arm, namespace="/PSM9"))
+    one = arm.CrtkArm(own_bus, absent, 32)
+    rows = topic_table.look(one, 0.1, 0.1, lambda: False)
+    found = topic_table.problems(rows)
+    assert any(line.startswith("/PSM9/measured_js") for line in found)
+    assert "/PSM9/measured_js" in topic_table.text(rows)
+    with mistakes.of("robot"):
+        one.measure()
+
+
+def test_commands_between_two_lie_on_the_manifold():
+    where = np.float32([0.0, 0.0, 0.15])
+    axes = np.float32([[0.1, 0.0, -1.0], [0.2, 0.1, -1.0]])
+    R, p = rcm.pose_on_manifold(axes, np.float32([0.2, 0.5]), np.float32([0.1, 0.12]), where)
+    a, b = (deploy.Command(deploy.Pose(R[i], p[i]), np.float32(i)) for i in range(2))
+    way = between.of(None, 4)(a, b, where)
+    assert [float(one.gripper) for one in way] == [0.25, 0.5, 0.75, 1.0]
+    tips = np.stack([a.pose.p, *(one.pose.p for one in way)])
+    assert max(float(rcm.rcm_error(one.pose, where)) for one in way) < 1e-6
+    steps = np.linalg.norm(np.diff(tips, axis=0), axis=-1)
+    np.testing.assert_allclose(steps, steps.mean(), rtol=0.1)
+    np.testing.assert_allclose(tips[-1], b.pose.p, atol=1e-6)
+    still = between.of(None, 4)(a, a, where)
+    np.testing.assert_allclose(still[0].pose.p, a.pose.p, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "argument"),
+    [
+        ('[arm]\nnamespace = "/PSM1"\ncommand = "move_cp"', "arm.command"),
+        ('[arm]\nnamespace = "/PSM1"\nframe = ""', "arm.frame"),
+        ('[arm]\nnamespace = "/PSM1"\nrate = 5', "arm.rate"),
+        ('[arm]\nnamespace = "/PSM1"\nposition = [14.0, 14.0, 153.0]', "arm.position"),
+        ('[arm]\nnamespace = "/PSM1"\nquaternion_xyzw = [0, 0, 0, 2]', "arm.quaternion_xyzw"),
+        ('[arm]\nnamespace = "/PSM1"\nspeed = 1', "arm.speed"),
+        ("[arm]", "arm.namespace"),
+        ('[arm]\nnamespace = "/PSM1"\n[limits]\nspeed = 0.0', "limits.speed"),
+        ('[arm]\nnamespace = "/PSM1"\n[limits]\nspeed = "fast"', "limits.speed"),
+        ('[arm]\nnamespace = "/PSM1"\n[force]', "force"),
+        ("namespace = ", ""),
+    ],
+)
+def test_a_file_is_checked(tmp_path, text, argument):
+    path = tmp_path / "robot.toml"
+    path.write_text(text)
+    with mistakes.of(f"{path}: {argument}" if argument else str(path)):
+        robot_file.read(path)
