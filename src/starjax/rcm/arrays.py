@@ -61,7 +61,10 @@ def compiled(*static: str) -> Callable[[Callable[Arguments, Result]], Callable[A
                 return function(*args, **kwargs)
             if program._cache_size() >= MAX_PROGRAMS:
                 program.clear_cache()
-            return program(*args, **kwargs)
+            try:
+                return program(*args, **kwargs)
+            except (TypeError, ValueError):  # jax adds lines to them; a mistake is one line
+                return function(*args, **kwargs)
 
         return broadcasting(mapped)
 

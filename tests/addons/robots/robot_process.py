@@ -2,7 +2,7 @@
 
     python robot_process.py DOMAIN [YAW]
 
-`freeze`, `thaw`, `state NAME`, `trocar X Y Z`, `rival`, `end`; at the end it prints what came.
+`freeze`, `thaw`, `state NAME`, `trocar X Y Z`, `rival`, `end`; then it prints its commands.
 """
 
 import json

@@ -150,7 +150,7 @@ def made(own_bus, file):
 
 
 def later(process, line, after=0.5):
-    """A stop condition that spoils the robot after a while, and then lets the run go on."""
+    """A stop condition that spoils the robot after a while and never stops the run."""
     begun = time.monotonic()
     said = []
 
@@ -202,7 +202,7 @@ def test_a_robot_that_is_killed_and_back_elsewhere_is_not_pulled(own_bus, tmp_pa
         node.run(one, client, 5.0, should_stop=lambda: next(stop))
         first.kill()
         with robot(yaw=0.25) as second:
-            report = node.run(one, client, 5.0)  # until the first doubt: nobody confirms
+            report = node.run(one, client, 5.0)  # until the first doubt: no person confirms
             assert report.fault and client.report.silent
             deadline = time.monotonic() + 20.0
             while node.doubts(one, client) and time.monotonic() < deadline:
@@ -242,7 +242,7 @@ def test_a_wrong_base_is_found_by_the_setpoint(own_bus, tmp_path):
         process.end()
 
 
-def test_a_topic_that_nobody_writes_is_named(own_bus, tmp_path):
+def test_a_topic_without_a_writer_is_named(own_bus, tmp_path):
     file = file_of(tmp_path)
     absent = dataclasses.replace(file, arm=dataclasses.replace(file.arm, namespace="/PSM9"))
     one = arm.CrtkArm(own_bus, absent, 32)

@@ -18,7 +18,7 @@ _IDENTITY = Pose(np.eye(3), np.zeros(3))
 _ENCODINGS = {"rgb8": False, "bgr8": True}  # True: blue first
 
 
-class Source(NamedTuple):
+class TopicSource(NamedTuple):
     """A topic that the arm reads.
 
     Attributes:
@@ -50,21 +50,21 @@ class CrtkArm:
         self._size, self._writers = image_size, {}
         self._base_name = "" if file.arm.frame == VIEW else file.arm.frame
         self._tip = crtk.tool_tip(file.instrument.wrist)
-        self._q = np.zeros(6)  # of the last command
+        self._q = np.zeros(6)  # joints of the last command
         at = file.arm.namespace
         pose, joints = messages.PoseStamped, messages.JointState
         self.sources = {
-            "pose": Source(f"{at}/local/measured_cp", pose),
-            "view": Source(f"{at}/measured_cp", pose),
-            "setpoint": Source(f"{at}/setpoint_cp", pose),
-            "joints": Source(f"{at}/measured_js", joints),
-            "jaw": Source(f"{at}/jaw/measured_js", joints),
-            "state": Source(f"{at}/operating_state", messages.OperatingState, "latched"),
+            "pose": TopicSource(f"{at}/local/measured_cp", pose),
+            "view": TopicSource(f"{at}/measured_cp", pose),
+            "setpoint": TopicSource(f"{at}/setpoint_cp", pose),
+            "joints": TopicSource(f"{at}/measured_js", joints),
+            "jaw": TopicSource(f"{at}/jaw/measured_js", joints),
+            "state": TopicSource(f"{at}/operating_state", messages.OperatingState, "latched"),
         }
         for name, camera in file.cameras.items():
-            self.sources[f"camera {name}"] = Source(camera.topic, messages.Image, "sensor")
+            self.sources[f"camera {name}"] = TopicSource(camera.topic, messages.Image, "sensor")
         if file.trocar.topic:
-            trocar = Source(file.trocar.topic, messages.PointStamped, "latched")
+            trocar = TopicSource(file.trocar.topic, messages.PointStamped, "latched")
             self.sources["trocar"] = trocar
         for source in self.sources.values():
             bus.read(*source)

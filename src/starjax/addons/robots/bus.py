@@ -17,7 +17,7 @@ from cyclonedds.util import duration
 from starjax.addons.robots.messages import ros_name
 from starjax.addons.robots.robot_file import Network
 
-_BLOCKING = duration(milliseconds=20)  # of a reliable writer with a full reader
+_BLOCKING = duration(milliseconds=20)  # wait of a reliable writer for a full reader
 _DEPTHS = {"default": 10, "servo": 1, "sensor": 5, "latched": 1}
 _URI = "CYCLONEDDS_URI"  # a user's own configuration replaces ours
 _AT_ONCE = 20  # messages of a topic that a poll reads

@@ -64,7 +64,7 @@ class SimArm:
             bus.read(f"{namespace}/{name}", kind)
 
     def run(self, seconds: float, should_stop: Callable[[], bool] = lambda: False) -> None:
-        """Steps in real time."""
+        """Moves and serves in real time."""
         due = time.monotonic()
         for _ in range(round(seconds * RATE)):
             if should_stop():

@@ -25,7 +25,7 @@ class SimRobotArgs:
 
     arm: str = "psm"  # the simulated arm
     task: str = "needle_pick"  # whose camera gives the images their size
-    namespace: str = "/PSM1"  # of the arm's topics
+    namespace: str = "/PSM1"  # namespace of the arm's topics
     instrument: str = "large_needle_driver"  # or prograsp
     image_size: Annotated[int, Range(8, 1080)] = 128  # pixels per side
     domain: Annotated[int, Range(0, 232)] = 0  # ROS_DOMAIN_ID
