@@ -66,13 +66,13 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> DemosWork:
             return False
         try:
             store.read_seal(root)
+        except errors.UsageError as error:
+            argument = _FROM if config.demos.from_ else error.argument
+            raise errors.UsageError(argument, error.expected, error) from error
         except ValueError as error:
             messages.indented(f"damaged, collected again: {error}")
             (root / "SEALED.json").unlink()
             return False
-        except errors.UsageError as error:
-            argument = _FROM if config.demos.from_ else error.argument
-            raise errors.UsageError(argument, error.expected, error) from error
         return True
 
     attempts = itertools.count()

@@ -234,8 +234,8 @@ class Client:
         self.doubts = self._doubts(moment)
         if arm := [doubt for doubt in self.doubts if doubt.kind == "arm"]:
             raise UsageError("observation", "an arm without doubt", str(arm[0]))
-        self._executor.begin(moment.pose, moment.gripper)
-        self._sent.append(self._executor.last.pose)
+        first = self._executor.begin(moment.pose, moment.gripper)
+        self._sent.append(first.pose)
         self._moments.extend([_bare(moment)] * self.input_spec.moments)
 
     def _forget(self) -> None:

@@ -120,10 +120,11 @@ def check(
     if skew > MAX_SKEW or (np.linalg.det(R) < 0.0).any():
         doubt("pose", f"no rotation, off by {skew:.2g}")
         return out
-    for name, stamp, kind in (
+    stamps: tuple[tuple[str, float | None, Literal["arm", "view"]], ...] = (
         ("stale pose", snapshot.stamp, "arm"),
         ("stale image", snapshot.image_stamp, "view"),
-    ):
+    )
+    for name, stamp, kind in stamps:
         if stamp is not None and not -MAX_FUTURE_S <= now - stamp <= tolerances.max_age_s:
             doubt(name, f"{now - stamp:.3g} s old, at most {tolerances.max_age_s:g} s", kind)
     if not snapshot.is_ready:

@@ -155,7 +155,7 @@ class PlanExecutor:
         """Returns the tips `[K, *arms, 3]` m of the present plan that are still to come."""
         if self._plan is None:
             return np.zeros((0, *self.p_world_trocar.shape), np.float32)
-        return self._plan.pose.p[self._index :]
+        return np.asarray(self._plan.pose.p)[self._index :]
 
     @property
     def needs_plan(self) -> bool:
@@ -206,8 +206,8 @@ class PlanExecutor:
         self.report.latencies.append(self._waited)
         return True
 
-    def begin(self, pose: Pose, gripper: np.ndarray) -> None:
-        """Takes the measured pose `[*arms]` as the first to hold, its axis put through the trocar.
+    def begin(self, pose: Pose, gripper: np.ndarray) -> Command:
+        """Returns the first command to hold: the measured pose `[*arms]`, put through the trocar.
 
         Raises:
           UsageError: a value is not finite, or that alone would exceed the limits.
@@ -223,6 +223,7 @@ class PlanExecutor:
             got = f"one that must turn by {turn:.2g} rad"
             raise UsageError("observation.pose", "a tool through the trocar", got)
         self.last = self._command(held, opening)
+        return self.last
 
     def step(self) -> Command:
         """Returns the next command `[*arms]`."""

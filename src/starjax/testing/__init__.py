@@ -41,7 +41,10 @@ def _registered(kind: str, part: Any) -> Iterator[str]:
         errors.choice(kind, part, kinds.kinds()[kind].names())
         yield part
         return
-    name, rows = getattr(part, "name", UNDER_TEST), registry.built_in
+    if registry is None:
+        raise errors.UsageError(kind, "the name of a part", type(part).__name__)
+    name = getattr(part, "name", UNDER_TEST)
+    rows: Any = registry.built_in  # the rows themselves: the part is taken out again
     before = rows.get(name)
     rows[name] = part
     try:

@@ -125,8 +125,9 @@ class Format(NamedTuple):
 def names_in(about: Any, column: str, shape: tuple[int, ...]) -> tuple[str, ...]:
     """Returns the names of a column's entries in a file's metadata, which are not trusted."""
     names = about.get(column) if isinstance(about, dict) else None
-    is_whole = isinstance(names, list) and len(names) == math.prod(shape)
-    return tuple(map(str, names)) if is_whole else ()
+    if not isinstance(names, list) or len(names) != math.prod(shape):
+        return ()
+    return tuple(map(str, names))
 
 
 def names_of(source: Source) -> dict[str, list[str]]:

@@ -1,5 +1,8 @@
 """A patient side manipulator on CRTK's topics: measurements in, commands out."""
 
+# pyright: reportArgumentType=false
+# Sequences of messages are lists: see `messages`.
+
 import time
 from typing import Any, NamedTuple
 
@@ -14,7 +17,7 @@ from starjax.errors import UsageError
 from starjax.types import Command, Pose
 
 WORLD = "world"  # frame of the policy's world in headers
-_IDENTITY = Pose(np.eye(3), np.zeros(3))
+_IDENTITY = crtk.pose_of_arrays(np.eye(3), np.zeros(3))
 _ENCODINGS = {"rgb8": False, "bgr8": True}  # True: blue first
 
 
@@ -193,7 +196,8 @@ class CrtkArm:
         if message.header.frame_id != self.file.arm.frame:
             expected, got = f"frame {WORLD} or {self.file.arm.frame}", message.header.frame_id
             raise UsageError("trocar.header.frame_id", expected, got or "none")
-        return crtk.compose(self.file.pose_world_base, Pose(np.eye(3), p)).p
+        point = crtk.pose_of_arrays(np.eye(3), p)
+        return np.asarray(crtk.compose(self.file.pose_world_base, point).p)
 
     def _image(self, name: str) -> np.ndarray:
         message = self._newest(name)

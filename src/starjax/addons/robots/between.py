@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +28,7 @@ def of(wrist: rcm.Wrist | None, steps: int) -> Callable[..., list[Command]]:
     def poses(last: Pose, target: Pose, p_world_trocar: jax.Array) -> Pose:
         _, move, turn = toward(last, target, p_world_trocar, jnp.inf, jnp.inf)
 
-        def part(fraction: jax.Array) -> Pose:
+        def part(fraction: Any) -> Pose:
             most = (jnp.where(x > _STILL, fraction * x, jnp.inf) for x in (move, turn))
             return toward(last, target, p_world_trocar, *most)[0]
 

@@ -103,9 +103,15 @@ def fill_pose(message: Any, pose_world_tip: Pose, frames: Frames) -> Any:
     return message
 
 
+def pose_of_arrays(R: Any, p: Any) -> Pose:
+    """Returns the pose of a rotation `[3, 3]` and a position `[3]` m of NumPy."""
+    return Pose(R, p)
+
+
 def pose_view_base(measured_cp: Any, local_measured_cp: Any) -> Pose:
     """Returns the pose of a dVRK arm's base in its endoscope, of two messages of one moment."""
-    tool = Frames(*[Pose(np.eye(3), np.zeros(3))] * 2)
+    identity = pose_of_arrays(np.eye(3), np.zeros(3))
+    tool = Frames(identity, identity)
     return compose(pose_of(measured_cp, tool), inverse(pose_of(local_measured_cp, tool)))
 
 

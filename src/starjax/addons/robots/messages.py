@@ -5,6 +5,9 @@ On the wire a topic `/PSM1/servo_cp` of `geometry_msgs/msg/PoseStamped` is `rt/P
 test decodes and encodes each type by `rosbags`. All types are final; ROS matches no others.
 """
 
+# pyright: reportAssignmentType=false
+# cyclonedds declares sequences by a type of its own, and takes lists and bytes.
+
 import time
 from dataclasses import dataclass, field
 

@@ -1,5 +1,8 @@
 """A policy on a robot's topics: checks, commands at the arm's rate, topics for rviz."""
 
+# pyright: reportArgumentType=false
+# Sequences of messages are lists: see `messages`.
+
 import time
 from collections.abc import Callable
 from typing import Any

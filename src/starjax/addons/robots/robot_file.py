@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from starjax.addons.robots import psm
+from starjax.addons.robots import crtk, psm
 from starjax.addons.robots.crtk import Jaw
 from starjax.errors import UsageError
 from starjax.types import Pose
@@ -108,7 +108,7 @@ class RobotFile:
     def pose_world_base(self) -> Pose:
         """Returns the base frame in the policy's world."""
         R = Rotation.from_quat(self.arm.quaternion_xyzw).as_matrix()
-        return Pose(R, np.array(self.arm.position))
+        return crtk.pose_of_arrays(R, np.array(self.arm.position))
 
     @property
     def p_world_trocar(self) -> np.ndarray:
@@ -146,7 +146,7 @@ def _table(path: Any, name: str, kind: Any, values: Any) -> Any:
         if key not in fields:
             raise UsageError(f"{path}: {name}.{key}", f"one of {', '.join(fields)}", "unknown")
         expected = {str: "text", int: "a whole number", float: "a number"}
-        kinds = {float: (int, float)}.get(fields[key].type, fields[key].type)
+        kinds: Any = (int, float) if fields[key].type is float else fields[key].type
         if fields[key].type in expected and (
             not isinstance(value, kinds) or isinstance(value, bool)
         ):
@@ -187,4 +187,4 @@ def _is_point(values: Any) -> bool:
 
 
 def _is_unit(values: Any) -> bool:
-    return len(values) == 4 and abs(np.linalg.norm(values) - 1.0) < 1e-3
+    return len(values) == 4 and bool(abs(np.linalg.norm(values) - 1.0) < 1e-3)

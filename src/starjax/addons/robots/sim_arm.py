@@ -5,6 +5,9 @@ Commands are approached at bounded joint speeds, and held after `WATCHDOG_S` wit
 centre; a `servo_cp` without a frame is the endoscope's, as on a dVRK.
 """
 
+# pyright: reportArgumentType=false
+# Sequences of messages are lists: see `messages`.
+
 import time
 from collections.abc import Callable
 from typing import Any
@@ -20,9 +23,10 @@ RATE = 200.0  # Hz
 WATCHDOG_S = 0.1
 HOME = np.array([0.1, 0.05, 0.13, 0.3, 0.0, 0.0])
 SPEED = np.array([2.0, 2.0, 0.3, 4.0, 4.0, 4.0])  # rad/s, m/s
-_TOOL = crtk.Frames(Pose(np.eye(3), np.zeros(3)), Pose(np.eye(3), np.zeros(3)))
+_IDENTITY = crtk.pose_of_arrays(np.eye(3), np.zeros(3))
+_TOOL = crtk.Frames(_IDENTITY, _IDENTITY)
 _R_VIEW_BASE = Rotation.from_euler("xyz", [2.4, 0.2, 0.4]).as_matrix()
-VIEW_BASE = Pose(_R_VIEW_BASE, np.array([0.05, -0.1, 0.12]))
+VIEW_BASE = crtk.pose_of_arrays(_R_VIEW_BASE, np.array([0.05, -0.1, 0.12]))
 
 
 class SimArm:
