@@ -33,6 +33,7 @@ def found(reset, takeover):
         following = state.replace(
             pose=after,
             velocity=velocity,
+            gripper=jaws,
             gripper_target=jaws,
             touch=jaws < 0.0,
             measurements=state.measurements.replace(block=block),
