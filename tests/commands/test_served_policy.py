@@ -34,6 +34,7 @@ class Stub:
     """The network of `stubs` as `deploy.Deployed`."""
 
     method, digest, monitor = "dp_ee", "d" * 64, None
+    max_off_trocar = np.inf  # the network holds no trocar
     scene = names.SceneNames("reach", (), (), ())
     settings = config.PolicyConfig(observation="state", obs_horizon=2, horizon=6, execute=4)
     input_spec = inputs.InputSpec(2, (), stubs.P_WORLD_REF[0], False, 0, (), 12)
