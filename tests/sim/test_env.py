@@ -300,7 +300,8 @@ def test_the_expert_starts_over_when_the_block_is_lost_on_the_way(reset, begin):
         there = state.replace(pose=state.pose._replace(p=wall[None] + jnp.array([[0.0, 0.0, off]])))
         return int(expert._following(script.replace(phase=jnp.asarray(phase)), there))
 
-    for phase in range(expert.RAISE, expert.WAIT):
+    assert after(expert.RETREAT, 0.004) == expert.RAISE  # the block is not on its peg
+    for phase in range(expert.RAISE, expert.RETREAT):
         is_carried = phase in (expert.LIFT, expert.CARRY)
         assert after(phase, 0.004) == phase + 1
         assert after(phase, 0.008) == (expert.RAISE if is_carried else phase + 1)
