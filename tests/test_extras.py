@@ -93,9 +93,9 @@ def test_an_extra_is_added_from_where_the_installation_came(monkeypatch, tmp_pat
     assert extras.install("sim,hub") == "pip install -e '.[sim,hub]'"
     wheel = tmp_path / "lib/starjax/extras.py"
     monkeypatch.setattr(extras, "__file__", str(wheel))
-    git = {"url": "https://a.example/s", "vcs_info": {"vcs": "git", "commit_id": "0a1b"}}
+    git = {"url": "https://localhost/s", "vcs_info": {"vcs": "git", "commit_id": "0a1b"}}
     for record, named in (
-        (json.dumps(git), "starjax[sim] @ git+https://a.example/s@0a1b"),
+        (json.dumps(git), "starjax[sim] @ git+https://localhost/s@0a1b"),
         (json.dumps({"url": "file:///x/s.whl"}), "starjax[sim] @ file:///x/s.whl"),
         (None, "starjax[sim]"),
     ):

@@ -8,8 +8,8 @@ SCENES, TROCARS, POINTS = 4000, 12, 5
 
 @pytest.fixture
 def decomposition(monkeypatch, pytestconfig):
-    monkeypatch.syspath_prepend(pytestconfig.rootpath / "benchmarks")
-    import _decomposition  # from the folder of benchmarks, which is no package
+    monkeypatch.syspath_prepend(pytestconfig.rootpath / "experiments" / "methods")
+    import _decomposition  # from the folder of its study, which is no package
 
     return _decomposition
 

@@ -10,9 +10,9 @@ from starjax.evaluation import content
 
 
 def named(pytestconfig, heading):
-    """Words in backticks of the tables below a heading, to the next one of its level."""
+    """Words in backticks of the tables below a heading, to the next one of its level or above."""
     text = (pytestconfig.rootpath / "docs/reference/files.md").read_text()
-    level = heading.split()[0]
+    level = rf"#{{1,{len(heading.split()[0])}}}"
     section = re.split(rf"^{level} ", text.partition(f"{heading}\n")[2], flags=re.MULTILINE)[0]
     cells = [line.split("|")[1] for line in section.splitlines() if line.startswith("|")]
     return {word for cell in cells for word in re.findall(r"`([^`]+)`", cell)}

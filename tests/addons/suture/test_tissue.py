@@ -16,7 +16,7 @@ H = 1.0 / 240
 SIZE = needles.CT1
 BODY = driving.Body(np.array([1.83e-4] * 3 + [4.01e-6] * 3), 1.79e-4)
 # Entry and exit off their marks (mm), largest force across the hole (N), work of the jaws (mJ).
-FROZEN = [0.0133, 0.0528, 0.0268, 6.483]
+FROZEN = [0.0053, 0.0489, 0.0205, 5.587]
 BITE = Bite(jnp.array([0.005, 0.001, 0.0]), jnp.array([-0.006, 0.001, 0.0]))
 
 
