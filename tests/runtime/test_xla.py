@@ -197,6 +197,6 @@ def test_a_start_takes_the_memory_of_each_device_unless_it_is_full(monkeypatch):
 
 
 def test_a_tilde_in_the_cache_is_the_home_folder(monkeypatch):
-    monkeypatch.setenv("HOME", "/home/me")
+    monkeypatch.setenv("HOME", "/users/me")
     monkeypatch.setenv("STARJAX_CACHE", "~/cache")
-    assert xla.cache_directory() == Path("/home/me/cache")
+    assert xla.cache_directory() == Path("/users/me/cache")
