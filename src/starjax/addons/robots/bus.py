@@ -70,7 +70,7 @@ class Bus:
     def writers(self, topic: str) -> list[str]:
         """Returns the types of other participants' writers on a topic, as ROS names them.
 
-        A writer that was killed counts until its lease of 10 s is over.
+        A killed writer counts for another 10 s, the time after which DDS gives a participant up.
         """
         return [ros_name(kind) for where, kind in self._others.values() if where == topic]
 
