@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from starjax.config import PolicyConfig
+from starjax.core.config import PolicyConfig
 
 
 class Product(NamedTuple):

@@ -17,7 +17,7 @@ import numpy as np
 from starjax.sim import coupling, dynamics, physics
 from starjax.sim.env import Env
 from starjax.sim.scene import Scene
-from starjax.sim.tasks.base import Contacts
+from starjax.sim.task import Contacts
 
 ITERATIONS = 50  # of C MuJoCo's solver: the models' own are those of `sim.solver`
 # Contacts that touch and measurements may see: two tools on a needle have up to 50. Our own physics

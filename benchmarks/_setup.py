@@ -10,16 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
-from starjax.config import PolicyConfig, TrainConfig
+from starjax.core.config import PolicyConfig, TrainConfig
+from starjax.core.methods import METHODS
+from starjax.core.types import Command, Observation, Pose
 from starjax.data import normalizer, windows
-from starjax.methods import METHODS
 from starjax.policies import features
 from starjax.policies import policy as policies
 from starjax.policies.learners.diffusion import DiffusionConfig
 from starjax.sim import registries
 from starjax.training import devices, state, step
 from starjax.training.sharding import StateLayout, StepCarry
-from starjax.types import Command, Observation, Pose
 
 TASK = registries.tasks.get("peg_transfer")
 P_WORLD_REF = np.array([slot.p_world_ref for slot in TASK.slots], np.float32)

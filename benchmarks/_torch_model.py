@@ -1,4 +1,4 @@
-"""The policy's networks in PyTorch: the same sizes and functions as those of `starjax.models`."""
+"""The policy's networks in PyTorch, of the sizes and functions of `starjax.policies.models`."""
 
 import torch
 import torch.nn.functional as F

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from starjax.core.types import Agent
 from starjax.sim import coupling, physics, solver
 from starjax.sim import env as envs
 from starjax.sim.quiet_mjx import mjx
 from starjax.sim.scene import Scene
-from starjax.types import Agent
 
 STEPS = 240  # control steps an episode, 8 s, so most states hold contacts
 CPU_LANES = 16  # of a program that has a CPU to itself: enough to share its operations out

@@ -21,14 +21,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import config, methods, runtime
+from starjax import runtime
+from starjax.core import config, methods
+from starjax.core.types import Command
 from starjax.data import load, windows
-from starjax.models import diffusion
-from starjax.models.kernels import parallel_ddim
 from starjax.policies import packaged, policy_file
 from starjax.policies import policy as policies
+from starjax.policies.models import diffusion
+from starjax.policies.models.kernels import parallel_ddim
 from starjax.sim import registries
-from starjax.types import Command
 
 FRAMES = 128
 AROUND = range(-2, 4)  # evaluations, from as many as are used

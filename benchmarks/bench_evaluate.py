@@ -25,11 +25,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm, runtime
+from starjax.core.types import Command
 from starjax.evaluation import evaluate, latency
 from starjax.policies import features, in_env, packaged
 from starjax.rollouts import agent, engine, episodes, workers
 from starjax.sim import env as envs
-from starjax.types import Command
 
 
 def main() -> None:

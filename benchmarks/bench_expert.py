@@ -25,7 +25,8 @@ import _timing
 import jax
 import jax.numpy as jnp
 
-from starjax import errors, rcm, runtime
+from starjax import rcm, runtime
+from starjax.core import errors
 from starjax.data import stillness
 from starjax.evaluation import expert as runs
 from starjax.evaluation.disturbances import base

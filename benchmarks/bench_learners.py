@@ -13,10 +13,11 @@ import _peer
 import _setup
 import _timing
 
-from starjax import config, runtime
-from starjax.commands import presets
+from starjax import runtime
+from starjax.cli import presets
+from starjax.core import config
+from starjax.core.learners import LEARNERS
 from starjax.evaluation import latency
-from starjax.learners import LEARNERS
 from starjax.policies import features
 
 SEEN = features.select_sensors(_setup.TASK)

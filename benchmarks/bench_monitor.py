@@ -11,11 +11,12 @@ import time
 import _timing
 import numpy as np
 
-from starjax import methods, runtime
+from starjax import runtime
+from starjax.core import methods
 from starjax.evaluation import latency
-from starjax.monitor import calibrate, scores, watch
 from starjax.policies import features, in_env, packaged
 from starjax.policies import policy as policies
+from starjax.policies.monitor import calibrate, scores, watch
 from starjax.sim import registries
 
 UPDATES = 150  # of an episode, 40 s

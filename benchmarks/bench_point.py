@@ -26,13 +26,13 @@ import numpy as np
 
 from starjax import rcm, runtime
 from starjax.addons.suture.needle_regrasp import task as regrasp
+from starjax.core.types import Agent, Pose
 from starjax.sim import bodies, registries
 from starjax.sim import env as envs
 from starjax.sim import scene as scenes
 from starjax.sim.quiet_mjx import mjx
-from starjax.sim.tasks.base import Contacts
-from starjax.sim.tasks.needle_pick import task
-from starjax.types import Agent, Pose
+from starjax.sim.task import Contacts
+from starjax.tasks.needle_pick import task
 
 STEPS = 240  # control steps, 8 s: all grasps are over
 SEED = 2026

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import runtime
-from starjax.commands import presets
+from starjax.cli import presets
 from starjax.data import redraw
 from starjax.sim import env as envs
 from starjax.sim.state import EnvParams, ImageSource

@@ -20,8 +20,8 @@ import jax.numpy as jnp
 
 from starjax import runtime
 from starjax.addons.suture import thread
+from starjax.core.types import Command
 from starjax.sim import env as envs
-from starjax.types import Command
 
 PERIODS, ROUNDS = 20, 9  # control periods per call; calls of each scene
 BATCHES = {"cpu": [16], "gpu": [360]}  # environments

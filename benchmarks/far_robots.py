@@ -17,7 +17,8 @@ import _far_robots
 import numpy as np
 from _far_robots import Network
 
-from starjax import config, config_json, runtime
+from starjax import runtime
+from starjax.core import config, config_json
 
 IMAGE_SIZE = 128  # of the policy that ships
 GROUP = 12  # trials that are simulated together
@@ -103,7 +104,7 @@ def summed(driven: _far_robots.Driven, network: Network) -> dict:
 def write(asked, env, driven, told: dict, name: str, spent: float) -> dict:
     """Writes a result file; returns its strict successes of all trials."""
     from starjax import deploy
-    from starjax.commands import policy_args
+    from starjax.cli import policy_args
     from starjax.evaluation import result, statistics, trial_file, trials
     from starjax.policies import packaged, policy_file
     from starjax.runtime import files

@@ -16,7 +16,7 @@ import numpy as np
 
 from starjax.report import results
 from starjax.sim import registries, scene
-from starjax.sim.tasks.peg_transfer import task
+from starjax.tasks.peg_transfer import task
 
 PERIOD_DEG = 60.0  # walls are 120 degrees apart, and jaws look alike after half a turn
 TURNED_DEG = 10.0

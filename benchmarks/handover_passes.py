@@ -15,7 +15,7 @@ import numpy as np
 
 from starjax.report import outcomes, results
 from starjax.sim import bodies, scene
-from starjax.sim.tasks.needle_pick import task as needle
+from starjax.tasks.needle_pick import task as needle
 
 TAKER = 1  # index of its arm
 CLOSES = 0.6  # of the jaws' largest opening in a trial

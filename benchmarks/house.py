@@ -96,7 +96,7 @@ def late_imports(tree: ast.Module) -> int:
 
 def commands(root: pathlib.Path) -> tuple[int, int]:
     """Returns the number of subcommands in the core's help, and in add-ons' tables."""
-    cli = root / "src/starjax/cli.py"
+    cli = root / "src/starjax/cli/__init__.py"
     file = cli if cli.is_file() else root / "src/starjax/cli/__init__.py"
     core = _keys(file, ("CORE", "_TABLE"))
     tables = sorted((root / "src/starjax/addons").glob("*/table.py"))

@@ -13,10 +13,10 @@ import mujoco
 import numpy as np
 
 from starjax import runtime
+from starjax.core.types import Pose
 from starjax.report import style
 from starjax.sim import endoscope_camera, render, scene
 from starjax.sim.camera import tissue
-from starjax.types import Pose
 
 PIXELS = 240  # a side of an image
 VIEWS = {"peg_transfer": "camera", "needle_pick": endoscope_camera.NAME}

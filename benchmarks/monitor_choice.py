@@ -19,8 +19,8 @@ import monitors
 import numpy as np
 
 from starjax.evaluation import alarms
-from starjax.monitor import calibrate, scores
 from starjax.policies import packaged, policy_file
+from starjax.policies.monitor import calibrate, scores
 from starjax.runtime import files
 
 EARLY, FALSE = 0.9, 0.1  # goals: failures announced before the clock, false alarms

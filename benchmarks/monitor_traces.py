@@ -18,7 +18,7 @@ import monitor_trials
 import numpy as np
 
 from starjax.evaluation import alarms, disturbances, sweep
-from starjax.monitor.scores import ScoreSettings
+from starjax.policies.monitor.scores import ScoreSettings
 from starjax.rollouts import plans
 from starjax.runtime import files, xla
 

@@ -16,12 +16,12 @@ from typing import Any, NamedTuple
 import monitors
 import numpy as np
 
-from starjax import config
-from starjax.commands import policy_args, policy_evaluation, scenes, session
+from starjax.cli import policy_args, policy_evaluation, scenes, session
+from starjax.core import config
 from starjax.evaluation import disturbances, sweep
 from starjax.evaluation.disturbances import base
-from starjax.monitor.scores import ScoreSettings
 from starjax.policies import policy_file
+from starjax.policies.monitor.scores import ScoreSettings
 from starjax.rcm.trocar import Trocar
 from starjax.runtime import files
 

@@ -24,11 +24,11 @@ import _timing
 import numpy as np
 
 from starjax.evaluation import alarms, statistics
-from starjax.monitor import calibrate, scores
 from starjax.policies import packaged, policy_file
+from starjax.policies.monitor import calibrate, scores
 from starjax.runtime import files
-from starjax.sim.tasks.base import CONTROL_HZ
-from starjax.sim.tasks.peg_transfer_bimanual.task import DROPPED_STEPS
+from starjax.sim.task import CONTROL_HZ
+from starjax.tasks.peg_transfer_bimanual.task import DROPPED_STEPS
 
 COLUMNS = ("success", "lost", "invalid", "steps", "scores")
 TESTED, UNDISTURBED = "nothing, trocars of the test", "nothing, the task's trocars"

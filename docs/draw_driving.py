@@ -13,8 +13,8 @@ import numpy as np
 from starjax.addons.suture.needle_drive import grasps, task
 from starjax.addons.suture.tissue import driving, prescribed
 from starjax.addons.suture.tissue import needle as needles
-from starjax.sim.tasks import scripting
-from starjax.types import Pose
+from starjax.core.types import Pose
+from starjax.tasks import scripting
 
 SIZE = needles.CT1
 H, SECONDS = 1.0 / 240.0, 4.0

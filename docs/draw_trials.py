@@ -20,7 +20,7 @@ from starjax.addons.viewer import frame as frames
 from starjax.addons.viewer import simulation
 from starjax.policies import packaged
 from starjax.report import encode, scene_view, video
-from starjax.sim.tasks.base import CONTROL_HZ
+from starjax.sim.task import CONTROL_HZ
 
 IMAGES = pathlib.Path(__file__).parent / "images"
 SIZE = 256  # pixels, side of a picture

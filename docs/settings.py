@@ -6,8 +6,9 @@ import inspect
 import re
 import typing
 
-from starjax import cli, config, limits
-from starjax.commands import options, presets
+from starjax import cli
+from starjax.cli import options, presets
+from starjax.core import config, limits
 
 _TRAILING = re.compile(r"^\s+(\w+): .*?#\s*(.*)$")
 

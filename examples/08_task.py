@@ -16,10 +16,10 @@ STEP = 0.002  # m a control step, of the expert
 
 def main() -> None:
     runtime.prepare_xla()  # before the first jax array, or physics on a CPU is slow
+    from starjax.core.types import Command
     from starjax.sim import env
-    from starjax.sim.tasks import base
-    from starjax.sim.tasks.reach import task as reach
-    from starjax.types import Command
+    from starjax.sim import task as base
+    from starjax.tasks.reach import task as reach
 
     def status(bound, layout, measurements) -> base.TaskStatus:
         off = jnp.linalg.norm(measurements.tip - layout.p - jnp.array([0.0, 0.0, ABOVE]))

@@ -6,8 +6,8 @@ own the entry point `starjax.learners` makes it `--policy.learner regression` of
 
 import dataclasses
 
-from starjax.learners import Learner
-from starjax.limits import Count
+from starjax.core.learners import Learner
+from starjax.core.limits import Count
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -59,7 +59,7 @@ def main() -> None:
     import jax.numpy as jnp
     import optax
 
-    from starjax import config
+    from starjax.core import config
     from starjax.policies import sequences
 
     sizes = sequences.Sizes(horizon=16, action=4, obs_horizon=2, vision=0, state=8, trocar=7)

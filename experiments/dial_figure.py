@@ -14,7 +14,7 @@ from typing import Any
 import claims
 import columns
 
-from starjax.methods import METHODS
+from starjax.core.methods import METHODS
 from starjax.report import style
 
 HERE = Path(__file__).resolve().parent

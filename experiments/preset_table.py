@@ -1,6 +1,6 @@
 """The table of presets, from their values."""
 
-from starjax.commands.presets import PRESETS
+from starjax.cli.presets import PRESETS
 from starjax.report import formats
 
 FOR = {

@@ -8,14 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import config, rcm
+from starjax import rcm
+from starjax.core import config
+from starjax.core.types import Command, Observation, Pose
 from starjax.data import normalizer, windows
 from starjax.policies import policy_file
 from starjax.policies.base import Params, Policy
 from starjax.policies.learners.diffusion import DiffusionConfig
 from starjax.sim import names
-from starjax.sim.tasks import base
-from starjax.types import Command, Observation, Pose
+from starjax.sim import task as base
 
 SCENE = names.SceneNames("peg_transfer", ("fr5",), ("grasper",), ("camera",))
 P_WORLD_REF = np.array([[0.0, 0.0, 0.15]], np.float32)

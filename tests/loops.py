@@ -7,9 +7,9 @@ import jax
 import jax.extend.core as jex
 import jax.numpy as jnp
 
+from starjax.core.types import Command
 from starjax.rcm.trocar import Trocar
 from starjax.sim import env as envs
-from starjax.types import Command
 
 
 def conditions(task: str) -> list[Any]:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from starjax import errors
+from starjax.core import errors
 
 
 @contextlib.contextmanager

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from starjax import config
-from starjax.learners import LEARNERS
+from starjax.core import config
+from starjax.core.learners import LEARNERS
 from starjax.policies import sequences
 
 ACTION = 2

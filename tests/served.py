@@ -10,9 +10,9 @@ import jax
 import numpy as np
 
 from starjax import deploy, rcm
+from starjax.core.methods import METHODS
 from starjax.data import normalizer
 from starjax.deploy import server, wire
-from starjax.methods import METHODS
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
 from starjax.runtime import connections

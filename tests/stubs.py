@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
+from starjax.core.types import Agent, Command, Observation, Pose
 from starjax.sim import names, render
+from starjax.sim import rescuer as rescue
+from starjax.sim import task as base
 from starjax.sim.state import ImageSource
-from starjax.sim.tasks import base, rescue
-from starjax.types import Agent, Command, Observation, Pose
 
 P_WORLD_REF = np.array([[0.0, 0.0, 0.15], [0.02, 0.1, 0.16]], np.float32)
 ROLL_ZERO = (0.0, float(np.pi))

@@ -7,7 +7,8 @@ import fakes
 import numpy as np
 import stubs
 
-from starjax import config, config_json, rcm
+from starjax import rcm
+from starjax.core import config, config_json
 from starjax.evaluation import result, statistics, sweep
 from starjax.evaluation import trials as table
 from starjax.rollouts import trocars

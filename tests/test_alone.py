@@ -8,7 +8,8 @@ import sys
 import alone
 import pytest
 
-from starjax import cli, extras
+from starjax import cli
+from starjax.core import extras
 
 ROOT = pathlib.Path(__file__).parents[1]
 

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from starjax import rcm
-from starjax.models.kernels import packed_params
+from starjax.policies.models.kernels import packed_params
 from starjax.runtime import provenance
 
 

@@ -7,7 +7,8 @@ import textwrap
 
 import pytest
 
-from starjax import cli, errors
+from starjax import cli
+from starjax.core import errors
 from starjax.runtime import files
 
 

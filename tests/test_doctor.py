@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from starjax import doctor
+from starjax.cli import doctor
 from starjax.runtime import gpu
 
 

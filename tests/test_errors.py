@@ -6,8 +6,8 @@ import mistakes
 import numpy as np
 import pytest
 
-from starjax import errors
-from starjax.commands import options
+from starjax.cli import options
+from starjax.core import errors
 from starjax.policies import packaged
 
 

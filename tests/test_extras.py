@@ -11,7 +11,8 @@ import types
 
 import pytest
 
-from starjax import cli, errors, extras
+from starjax import cli
+from starjax.core import errors, extras
 
 ROOT = pathlib.Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

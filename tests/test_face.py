@@ -7,7 +7,7 @@ import sys
 import pytest
 
 import starjax
-from starjax import errors, registry
+from starjax.core import errors, registry
 
 
 def test_the_face_is_small():

@@ -3,7 +3,7 @@
     python tests/test_goldens.py PART...    writes tests/golden/identity/PART.json anew
 
 - `model` (bytes of the compiled MJCF) stands apart from what users' files are found by. Versions
-  and digests of code are those of runtime/accepted.json.
+  and digests of code are those of core/accepted.json.
 - `steps`, `losses` and `trials` hold to the last bit on the machine that wrote them (`machine`),
   and within `TOLERANCE` on others.
 - A commit that changes an expert rewrites `steps` and `trials` and leaves golden/benchmark.json;
@@ -30,8 +30,9 @@ if __name__ == "__main__":
 import jax
 import numpy as np
 
-from starjax import cli, config_json, methods
-from starjax.commands import options, presets
+from starjax import cli
+from starjax.cli import options, presets
+from starjax.core import config_json, methods
 from starjax.data import load, schema
 from starjax.evaluation import protocol
 from starjax.evaluation.disturbances import DISTURBANCES, base
@@ -49,7 +50,7 @@ DIGITS = 12  # of a digest
 SHORT = 60  # characters of a value that a golden file shows as it is
 # Values of the machine and its packages.
 VOLATILE = ("versions", "jax_settings", "platform", "lanes", "chunk", "command")
-CODE = ("parts", "source")  # runtime/accepted.json has them
+CODE = ("parts", "source")  # core/accepted.json has them
 STEPS, LOSSES, TRIALS, LANES = 30, 100, 3, 8
 # On another machine: m of a tip after `STEPS`, parts of a loss, trials of a task's 36, parts of
 # their mean length.

@@ -6,14 +6,10 @@ import pathlib
 SOURCE = pathlib.Path(__file__).parents[1] / "src" / "starjax"
 # From left to right; a layer may import itself and those of the rows before its own.
 ROWS = (
-    ("errors", "moved"),
-    ("extras",),
-    ("extensions", "types", "limits", "registry", "runtime"),
-    ("methods",),
-    ("learners",),
-    ("config", "rcm"),
-    ("config_json",),
-    ("models", "monitor", "sim"),
+    ("core",),
+    ("rcm", "runtime"),
+    ("sim",),
+    ("tasks",),
     ("rollouts",),
     ("data",),
     ("policies",),
@@ -21,11 +17,10 @@ ROWS = (
     ("training",),
     ("deploy", "envs"),
     ("report",),
-    ("commands",),
-    ("api",),
+    ("cli",),
     ("addons",),
 )
-COMMANDS = {"commands", "experiments", "doctor", "cli", "testing", "__main__"}  # one layer
+COMMANDS = {"cli", "experiments", "testing", "__main__"}  # one layer
 PLACE = {name: row for row, names in enumerate(ROWS) for name in names}
 
 
@@ -34,7 +29,7 @@ def layer(path: pathlib.Path) -> str:
 
 
 def named(part: str) -> str:
-    return "commands" if part in COMMANDS else part
+    return "cli" if part in COMMANDS else part
 
 
 def imported(source: str) -> set[str]:
@@ -73,7 +68,7 @@ def test_add_ons_do_not_know_each_other():
 def test_tables_of_add_ons_import_nothing_but_their_record():
     for path in (SOURCE / "addons").glob("*/table.py"):
         imports = [n for n in ast.walk(ast.parse(path.read_text())) if hasattr(n, "names")]
-        assert [node.module for node in imports] == ["starjax.extensions"], path
+        assert [node.module for node in imports] == ["starjax.core.extensions"], path
 
 
 def test_every_layer_has_a_place():

@@ -7,8 +7,8 @@ import operator
 import mistakes
 import pytest
 
-from starjax import config, limits
-from starjax.commands import bench, evaluate, pack, sweep
+from starjax.cli import bench, evaluate, pack, sweep
+from starjax.core import config, limits
 
 STARTS = (config.RunConfig(), evaluate.EvaluateArgs(), sweep.SweepArgs(), bench.BenchArgs("x"))
 RANGES = [

@@ -10,8 +10,8 @@ import zipfile
 import numpy as np
 import pytest
 
-from starjax import config, config_json
-from starjax.commands import demonstrations, folders
+from starjax.cli import demonstrations, folders
+from starjax.core import config, config_json
 from starjax.data import load
 from starjax.evaluation import evaluate, result
 from starjax.evaluation import trials as tables

@@ -35,9 +35,11 @@ HOSTS = {
     "docs.jax.dev",
     "docs.python.org",
     "flax.readthedocs.io",
+    "github.com",
     "gymnasium.farama.org",
     "localhost",
     "mujoco.readthedocs.io",
+    "pandas.pydata.org",
     "slurm.schedmd.com",
     "www.apache.org",
     "www.w3.org",
@@ -68,7 +70,8 @@ def test_no_pickle():
 def test_no_hosts_and_no_paths_of_one_machine():
     for path in TEXT:
         text = path.read_text()
-        hosts = set(re.findall(r"https?://([\w.-]+)", text)) - HOSTS
+        found = {host.lower() for host in re.findall(r"https?://([\w.-]+)", text)} - HOSTS
+        hosts = {host for host in found if not host.endswith("example.org")}
         paths = re.findall(r"(?<![\w./-])/(?:home|root|tmp|work|Users)/\w+", text)
         assert not hosts and not paths, path
 
@@ -100,7 +103,7 @@ def test_every_folder_of_the_package_is_one():
 
 
 def test_import_of_the_package_is_light():
-    assert python("-X", "importtime", "-c", "import starjax").stderr.count("jax.") <= 1
+    assert python("-X", "importtime", "-c", "import starjax").stderr.count(" jax.") == 0
 
 
 def test_the_citation_names_this_version():

@@ -6,8 +6,9 @@ import sys
 
 import pytest
 
-from starjax import cli, config, errors, extensions, methods, rcm, registry
-from starjax.commands import policy_args, presets, run_settings
+from starjax import cli, rcm
+from starjax.cli import policy_args, presets, run_settings
+from starjax.core import config, errors, extensions, methods, registry
 from starjax.sim import registries
 
 
@@ -90,9 +91,9 @@ def test_broken_mounts_leave_those_of_others(install):
 
 PARTS = """
 import dataclasses
-from starjax import methods
-from starjax.commands import presets
-from starjax.models.encoders import SMALL
+from starjax.core import methods
+from starjax.cli import presets
+from starjax.policies.models.encoders import SMALL
 from starjax.policies.external import ExternalPolicy
 from starjax.rcm import ACTION_SPACES
 
@@ -149,7 +150,7 @@ def test_a_row_of_starjax_has_one_owner(install, group):
 
 WIDE = """
 import dataclasses
-from starjax.learners import Learner
+from starjax.core.learners import Learner
 @dataclasses.dataclass(frozen=True)
 class Wide:
     horizon: int = 3
@@ -178,7 +179,7 @@ def test_a_traceback_is_shown_only_when_asked_for(capsys):
 
 
 COMMAND = """
-from starjax.extensions import Subcommand
+from starjax.core.extensions import Subcommand
 HELLO = Subcommand("lab_i", "greets")
 def main(argv):
     print("hello", *argv)

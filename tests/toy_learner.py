@@ -3,9 +3,9 @@
 import dataclasses
 from typing import Annotated
 
-from starjax import errors
-from starjax.learners import Learner
-from starjax.limits import Range
+from starjax.core import errors
+from starjax.core.learners import Learner
+from starjax.core.limits import Range
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -20,10 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm, runtime
+from starjax.core.types import Agent
 from starjax.evaluation import expert as runs
 from starjax.sim import env as envs
 from starjax.sim import registries, sampling
-from starjax.types import Agent
 
 TOOLS = ("needle_driver", "prograsp")
 # Tasks, and their experts for these tools.

@@ -25,8 +25,8 @@ import numpy as np
 from starjax import runtime
 from starjax.sim import env as envs
 from starjax.sim import registries
-from starjax.sim.tasks.base import CONTROL_HZ
-from starjax.sim.tasks.rescue import Rescuer
+from starjax.sim.rescuer import Rescuer
+from starjax.sim.task import CONTROL_HZ
 
 SEED, STEPS = 31, 600  # a seed that no expert was adjusted on
 EVERY = 7  # control steps between two entries

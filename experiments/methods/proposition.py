@@ -43,10 +43,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm, runtime
+from starjax.core.types import Agent, Command
 from starjax.sim import env as envs
 from starjax.sim import wrists
-from starjax.sim.tasks.base import Task
-from starjax.types import Agent, Command
+from starjax.sim.task import Task
 
 # Names of the phases of scripts that only number them, in order.
 PHASES = {
@@ -96,7 +96,7 @@ def names(task: str) -> list[str]:
     """Names of the expert's phases."""
     if task in PHASES:
         return PHASES[task].split()
-    return list(importlib.import_module(f"starjax.sim.tasks.{task}.expert").PHASES)
+    return list(importlib.import_module(f"starjax.tasks.{task}.expert").PHASES)
 
 
 def points(task: Task) -> list[str]:

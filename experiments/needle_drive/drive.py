@@ -22,8 +22,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starjax import rcm, runtime
+from starjax.core.types import Command
 from starjax.sim import env as envs
-from starjax.types import Command
 
 STEPS = 300  # control steps, 10 s: all drives are over
 SEED = 2026

@@ -22,12 +22,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm, runtime
+from starjax.core.types import Command, Pose
 from starjax.sim import env as envs
 from starjax.sim import ik, mounts, registries
 from starjax.sim.env import Env
-from starjax.sim.tasks import scripting
-from starjax.sim.tasks.base import CONTROL_HZ
-from starjax.types import Command, Pose
+from starjax.sim.task import CONTROL_HZ
+from starjax.tasks import scripting
 
 TOOLS = ("needle_driver", "prograsp")
 WORKSPACE = registries.workspaces.get("board")

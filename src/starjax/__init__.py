@@ -13,12 +13,12 @@ errors of a command line do without jax.
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from starjax import moved
+from starjax.core import moved
 
 if TYPE_CHECKING:  # for editors
     from starjax import deploy, rcm
-    from starjax.api import evaluate, load_policy, train
-    from starjax.registry import Rows
+    from starjax.cli.api import evaluate, load_policy, train
+    from starjax.core.registry import Rows
     from starjax.sim.env import make as make_env
 
     ARMS: Rows
@@ -35,16 +35,16 @@ __all__ = (
 # Name -> `module:object`, or a module.
 _PLACES = {
     "ARMS": "starjax.sim.registries:arms",
-    "LEARNERS": "starjax.learners:LEARNERS",
-    "METHODS": "starjax.methods:METHODS",
-    "PRESETS": "starjax.commands.presets:PRESETS",
+    "LEARNERS": "starjax.core.learners:LEARNERS",
+    "METHODS": "starjax.core.methods:METHODS",
+    "PRESETS": "starjax.cli.presets:PRESETS",
     "TASKS": "starjax.sim.registries:tasks",
     "deploy": "starjax.deploy",
-    "evaluate": "starjax.api:evaluate",
-    "load_policy": "starjax.api:load_policy",
+    "evaluate": "starjax.cli.api:evaluate",
+    "load_policy": "starjax.cli.api:load_policy",
     "make_env": "starjax.sim.env:make",
     "rcm": "starjax.rcm",
-    "train": "starjax.api:train",
+    "train": "starjax.cli.api:train",
 }
 _COMPILED = ("evaluate", "load_policy", "make_env", "train")
 moved.install()
@@ -54,7 +54,8 @@ def __getattr__(name: str) -> Any:
     """Imports a name of the face."""
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from starjax import registry, runtime
+    from starjax import runtime
+    from starjax.core import registry
 
     if name in _COMPILED:
         runtime.prepare_xla()  # jax reads these settings when it starts

@@ -20,8 +20,8 @@ from typing import IO
 
 import recorded
 
-from starjax import errors
 from starjax.addons.formats import base, exchange
+from starjax.core import errors
 from starjax.runtime import files
 
 BATCH = 4000  # damages a process

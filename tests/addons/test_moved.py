@@ -4,7 +4,7 @@ import importlib
 
 import pytest
 
-from starjax import moved
+from starjax.core import moved
 
 PAGES = """
 from starjax.data.formats.base import Column, Format, Source
@@ -12,7 +12,6 @@ from starjax.deploy import crtk
 from starjax.deploy import psm
 from starjax.envs import playground
 from starjax.sim import six_blocks
-from starjax.sim.tasks.needle_drive import task
 from starjax.sim.tissue import driving
 from starjax.viewer import frame
 import starjax.sim.thread

@@ -8,8 +8,9 @@ import fakes
 import mistakes
 import pytest
 
-from starjax import cli, config
-from starjax.commands import bench, folders, policy_args, presets
+from starjax import cli
+from starjax.cli import bench, folders, policy_args, presets
+from starjax.core import config
 
 SMOKE = presets.PRESETS["smoke"]
 

@@ -5,7 +5,7 @@ import dataclasses
 import mistakes
 import pytest
 
-from starjax.commands import benchmark_args, evaluate, run_settings, stress, sweep
+from starjax.cli import benchmark_args, evaluate, run_settings, stress, sweep
 from starjax.evaluation import protocol
 
 COMMANDS = {

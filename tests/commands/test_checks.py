@@ -6,8 +6,9 @@ import os
 import mistakes
 import pytest
 
-from starjax import cli, config, limits, methods
-from starjax.commands import checks, presets, report_command
+from starjax import cli
+from starjax.cli import checks, presets, report_command
+from starjax.core import config, limits, methods
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import stubs
 
-from starjax import config, errors
-from starjax.commands import demonstrations, presets
+from starjax.cli import demonstrations, presets
+from starjax.core import config, errors
 from starjax.rollouts import sharing
 from starjax.sim import registries
 

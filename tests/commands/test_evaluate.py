@@ -12,8 +12,8 @@ import pytest
 import safetensors.numpy
 import stubs
 
-from starjax import config, config_json, rcm
-from starjax.commands import (
+from starjax import rcm
+from starjax.cli import (
     calibrate,
     evaluate,
     folders,
@@ -23,11 +23,12 @@ from starjax.commands import (
     stress,
     sweep,
 )
+from starjax.core import config, config_json
 from starjax.data import normalizer
 from starjax.evaluation import sweep as sweeping
-from starjax.monitor import scores
 from starjax.policies import in_env, packaged, policy_file
 from starjax.policies.base import Policy
+from starjax.policies.monitor import scores
 from starjax.report import video
 from starjax.runtime import files, gpu
 

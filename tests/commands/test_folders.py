@@ -12,8 +12,8 @@ import mistakes
 import numpy as np
 import pytest
 
-from starjax import config, config_json, errors, methods
-from starjax.commands import folders, presets, stage_times
+from starjax.cli import folders, presets, stage_times
+from starjax.core import config, config_json, errors, methods
 from starjax.runtime import files
 
 SMOKE = presets.PRESETS["smoke"]

@@ -7,8 +7,8 @@ import fakes
 import numpy as np
 import pytest
 
-from starjax import config, methods
-from starjax.commands import messages, plan_text, presets
+from starjax.cli import messages, plan_text, presets
+from starjax.core import config, methods
 from starjax.policies import packaged, policy_file
 from starjax.policies import policy as policies
 

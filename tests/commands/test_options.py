@@ -10,8 +10,8 @@ import sys
 import mistakes
 import pytest
 
-from starjax import cli, config, extras, methods
-from starjax.commands import (
+from starjax import cli
+from starjax.cli import (
     bench,
     completion,
     evaluate,
@@ -23,6 +23,7 @@ from starjax.commands import (
     stress,
     sweep,
 )
+from starjax.core import config, extras, methods
 from starjax.runtime import gpu
 
 OPTIONS = {

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from starjax import config, errors
-from starjax.commands import pack
+from starjax.cli import pack
+from starjax.core import config, errors
 from starjax.data import normalizer
-from starjax.monitor import calibrate, scores
 from starjax.policies import policy_file
+from starjax.policies.monitor import calibrate, scores
 
 POLICY = config.with_options(dataclasses.replace(fakes.TINY, dtype="bfloat16"), temperature=0.5)
 

@@ -13,8 +13,8 @@ import pytest
 import stubs
 import synthetic
 
-from starjax import config, config_json, methods
-from starjax.commands import demonstrations, folders, pipeline, presets, scenes, scored
+from starjax.cli import demonstrations, folders, pipeline, presets, scenes, scored
+from starjax.core import config, config_json, methods
 from starjax.data import normalizer
 from starjax.policies import in_env, policy_file
 from starjax.rollouts import sharing
@@ -205,7 +205,7 @@ def test_more_trials_than_asked_for_are_not_thrown_away(tmp_path):
 
 
 def test_a_twins_trials_are_not_run_again(tmp_path, monkeypatch):
-    from starjax.commands import policy_evaluation
+    from starjax.cli import policy_evaluation
 
     preset = smoke(tmp_path, "stardiff_single")
     for name in ("dp_rcm4", "stardiff_single"):

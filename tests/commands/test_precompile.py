@@ -9,16 +9,10 @@ import pytest
 import stubs
 from fakes import TASK, TINY, dataset, relative, trained
 
-from starjax import config
-from starjax.commands import (
-    demonstrations,
-    pipeline,
-    policy_evaluation,
-    precompile,
-    stage_times,
-)
+from starjax.cli import demonstrations, pipeline, policy_evaluation, precompile, stage_times
+from starjax.core import config
+from starjax.core.methods import METHODS
 from starjax.data import normalizer
-from starjax.methods import METHODS
 from starjax.policies import generator, in_env, policy_file
 from starjax.policies import policy as policies
 from starjax.rollouts import sharing

@@ -6,8 +6,8 @@ import pathlib
 
 import pytest
 
-from starjax import config, config_json, errors
-from starjax.commands import presets, run_settings
+from starjax.cli import presets, run_settings
+from starjax.core import config, config_json, errors
 from starjax.runtime import gpu
 
 RESULTS = pathlib.Path(__file__).parents[2] / "experiments"

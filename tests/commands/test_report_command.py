@@ -5,7 +5,7 @@ import shutil
 import mistakes
 import synthetic
 
-from starjax.commands import report_command
+from starjax.cli import report_command
 from starjax.report import build
 
 

@@ -6,8 +6,9 @@ import fakes
 import mistakes
 import pytest
 
-from starjax import cli, config
-from starjax.commands import folders, scenes
+from starjax import cli
+from starjax.cli import folders, scenes
+from starjax.core import config
 
 
 def test_names_that_are_left_out_are_the_tasks():
@@ -63,8 +64,8 @@ def test_a_folder_of_another_scene_is_refused(tmp_path):
 
 
 def test_the_list_names_everything_that_flags_can(capsys):
-    from starjax import methods
-    from starjax.commands import presets
+    from starjax.cli import presets
+    from starjax.core import methods
     from starjax.policies import packaged
     from starjax.sim import registries
 

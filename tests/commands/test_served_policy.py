@@ -14,16 +14,17 @@ import served
 import stubs
 from websockets.sync import server as sockets
 
-from starjax import config, rcm
-from starjax.commands import evaluate, stress, sweep
+from starjax import rcm
+from starjax.cli import evaluate, stress, sweep
+from starjax.core import config
+from starjax.core.types import Command, Pose
 from starjax.deploy import approach, batching, connection_pool, inputs, wire
 from starjax.deploy import served as serving
 from starjax.evaluation import evaluate as evaluating
-from starjax.monitor import calibrate, scores
 from starjax.policies import in_env
+from starjax.policies.monitor import calibrate, scores
 from starjax.rollouts import agent
 from starjax.sim import names
-from starjax.types import Command, Pose
 
 TRIALS = ["--eval.trials=1", "--eval.time-limit-s=1", "--no-video"]
 SAMPLE, PARAMS = stubs.make_policy()

@@ -6,7 +6,7 @@ import mistakes
 import numpy as np
 import pytest
 
-from starjax.commands import bench, policy_args, sweep
+from starjax.cli import bench, policy_args, sweep
 from starjax.sim import registries
 
 

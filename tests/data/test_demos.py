@@ -18,13 +18,14 @@ import numpy as np
 import pytest
 import stubs
 
-from starjax import errors, rcm
+from starjax import rcm
+from starjax.core import errors
+from starjax.core.types import Agent
 from starjax.data import demos, load, schema, store
 from starjax.rollouts import agent, engine, episodes, fetching, programs, success_quota, workers
 from starjax.rollouts.placement import DeviceLayout
 from starjax.runtime import files, xla
 from starjax.sim import env as sim_env
-from starjax.types import Agent
 
 TROCARS = stubs.trocars(0, 8)
 SETTINGS = schema.DemoSettings(per_trocar=4, seed=0, max_steps=100)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import stubs
 
-from starjax import errors
+from starjax.core import errors
 from starjax.data import demos, schema
 from starjax.rollouts import agent
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from starjax import rcm
+from starjax.core.methods import METHODS
 from starjax.data import normalizer
-from starjax.methods import METHODS
 
 FRAMES = np.arange(240)
 RELATIVE = ["rcm1", "rcm2", "rcm3", "rcm1_fixed_yaw", "rcm2_fixed_yaw"]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax import errors
+from starjax.core import errors
 from starjax.data import demos, episode_images, load, redraw, schema, store
 from starjax.data.placed_images import JoinedImages
 from starjax.rollouts import agent

@@ -2,7 +2,7 @@
 
 import pytest
 
-from starjax import errors
+from starjax.core import errors
 from starjax.data import store
 from starjax.runtime import files
 

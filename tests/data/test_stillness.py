@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from starjax.core.types import Command, Pose
 from starjax.data import stillness
-from starjax.types import Command, Pose
 
 STEPS = 12
 

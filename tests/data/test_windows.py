@@ -6,9 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax import methods, rcm
+from starjax import rcm
+from starjax.core import methods
+from starjax.core.methods import METHODS
 from starjax.data import normalizer, windows
-from starjax.methods import METHODS
 
 STRAIGHT = {name: row for name, row in METHODS.items() if not row.has_wrist}
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from starjax import deploy, rcm
+from starjax.core.errors import UsageError
 from starjax.data import normalizer
 from starjax.deploy import approach
-from starjax.errors import UsageError
 
 RNG = np.random.default_rng(0)
 P_WORLD_TROCAR = np.array([0.014, 0.014, 0.153], np.float32)

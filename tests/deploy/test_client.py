@@ -15,12 +15,12 @@ import served
 from scipy.spatial.transform import Rotation
 
 from starjax import deploy, rcm
+from starjax.core.errors import UsageError
+from starjax.core.types import Command, Pose
 from starjax.deploy import batching, connection_pool, plan_executor, wire
 from starjax.deploy.connection import Connection, Reply
-from starjax.errors import UsageError
-from starjax.monitor import calibrate, scores
+from starjax.policies.monitor import calibrate, scores
 from starjax.sim import registries
-from starjax.types import Command, Pose
 
 HORIZON, EXECUTE = 16, 8
 WHERE = np.asarray(rcm.trocar_position(served.PORT, np.float32([0.0, 0.0, 0.15])))

@@ -5,7 +5,7 @@ import types
 import numpy as np
 import pytest
 
-from starjax import errors
+from starjax.core import errors
 from starjax.deploy import connection_pool, external, greeting
 from starjax.policies.external import ExternalPolicy
 

@@ -7,8 +7,8 @@ import re
 import numpy as np
 import pytest
 
+from starjax.core.types import Pose
 from starjax.deploy import guard
-from starjax.types import Pose
 
 PAGE = pathlib.Path(__file__).parents[2] / "docs" / "use" / "real-robot.md"
 TROCAR = np.array([0.01, -0.02, 0.15])

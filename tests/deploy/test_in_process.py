@@ -6,7 +6,7 @@ import pytest
 import served
 
 from starjax import deploy, rcm
-from starjax.errors import UsageError
+from starjax.core.errors import UsageError
 from starjax.sim import registries
 
 

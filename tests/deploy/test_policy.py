@@ -13,15 +13,16 @@ import numpy as np
 import pytest
 import strict
 
-from starjax import config, deploy, rcm
+from starjax import deploy, rcm
+from starjax.core import config
+from starjax.core.errors import UsageError
+from starjax.core.methods import METHODS
+from starjax.core.types import Observation
 from starjax.data import normalizer
-from starjax.errors import UsageError
-from starjax.methods import METHODS
-from starjax.monitor import calibrate, scores
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
+from starjax.policies.monitor import calibrate, scores
 from starjax.sim import names, registries
-from starjax.types import Observation
 
 TRAIN = config.TrainConfig()
 GOLDEN = pathlib.Path(__file__).parents[1] / "golden"

@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from websockets.sync import client as sockets
 
 from starjax import rcm
-from starjax.commands import serve
+from starjax.cli import serve
+from starjax.core.errors import UsageError
 from starjax.deploy import batching, server, wire
-from starjax.errors import UsageError
 from starjax.runtime import connections
 from starjax.sim import registries
 

@@ -5,15 +5,16 @@ import jax
 import numpy as np
 import pytest
 
-from starjax import config, deploy, rcm
+from starjax import deploy, rcm
+from starjax.core import config
+from starjax.core.errors import UsageError
+from starjax.core.methods import METHODS
+from starjax.core.types import Command, Pose
 from starjax.data import normalizer
 from starjax.deploy import inputs, plan_executor, plan_motion
-from starjax.errors import UsageError
-from starjax.methods import METHODS
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
 from starjax.sim import registries, wrists
-from starjax.types import Command, Pose
 
 WRIST = rcm.LARGE_NEEDLE_DRIVER
 WHERE = np.float32([0.01, -0.02, 0.15])

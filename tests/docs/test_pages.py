@@ -10,13 +10,14 @@ import tomllib
 
 import pytest
 
-from starjax import cli, errors, methods, rcm
+from starjax import cli, rcm
 from starjax.addons.formats import mapping
 from starjax.addons.formats.base import FORMATS
 from starjax.addons.robots import robot_file
-from starjax.commands import presets
+from starjax.cli import presets
+from starjax.core import errors, methods
+from starjax.core.learners import LEARNERS
 from starjax.evaluation.disturbances import DISTURBANCES
-from starjax.learners import LEARNERS
 from starjax.sim import registries
 
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)

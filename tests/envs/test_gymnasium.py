@@ -11,7 +11,8 @@ import pytest
 from gymnasium.utils import env_checker
 
 import starjax.envs
-from starjax import errors, rcm
+from starjax import rcm
+from starjax.core import errors
 from starjax.envs import registration, settings, trocar_draws, vector
 from starjax.sim import registries
 

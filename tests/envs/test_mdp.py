@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from starjax import rcm
+from starjax.core.types import Command, Pose
 from starjax.envs import mdp, ranges, settings
 from starjax.sim import registries
-from starjax.types import Command, Pose
 
 STEPS = 40
 

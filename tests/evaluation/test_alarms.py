@@ -8,7 +8,7 @@ import stubs
 
 from starjax.evaluation import alarms, evaluate
 from starjax.evaluation import trials as tables
-from starjax.monitor import calibrate, scores, watch
+from starjax.policies.monitor import calibrate, scores, watch
 from starjax.rollouts import agent, engine, episodes, plans
 
 EXECUTE, HORIZON = 4, 6

@@ -6,10 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax import errors, rcm
-from starjax.commands import stress
+from starjax import rcm
+from starjax.cli import stress
+from starjax.core import errors
+from starjax.core.types import Command, Pose
 from starjax.evaluation.disturbances import base, wrists
-from starjax.types import Command, Pose
 
 WRIST = rcm.LARGE_NEEDLE_DRIVER
 ENV = SimpleNamespace(

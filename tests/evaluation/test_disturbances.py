@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import stubs
 
+from starjax.core.types import Command, Pose
 from starjax.evaluation import disturbances
 from starjax.evaluation.disturbances import DISTURBANCES, base, images, timing, trocars
 from starjax.evaluation.disturbances.base import with_disturbances, with_random_levels
 from starjax.sim import env as envs
 from starjax.sim.state import EnvParams
-from starjax.types import Command, Pose
 
 KEY = jax.random.key(3)
 PARAMS = EnvParams(jax.tree.map(lambda x: x[0], stubs.trocars(4, arms=2)))

@@ -18,10 +18,10 @@ import pytest
 import stubs
 
 from starjax import rcm
+from starjax.core.methods import METHODS
 from starjax.data import normalizer
 from starjax.evaluation import evaluate, recorded, statistics
 from starjax.evaluation import trials as tables
-from starjax.methods import METHODS
 from starjax.policies import policy as policies
 from starjax.rollouts import agent, chunks, engine, placement
 from starjax.rollouts.episodes import Episode

@@ -5,10 +5,10 @@ import dataclasses
 import fakes
 import pytest
 
+from starjax.core.methods import METHODS
 from starjax.evaluation import latency
-from starjax.methods import METHODS
-from starjax.models import roll_net
 from starjax.policies import features
+from starjax.policies.models import roll_net
 
 SEEN = features.select_sensors(fakes.TASK)
 

@@ -9,9 +9,9 @@ import pathlib
 
 import pytest
 
+from starjax.core import sources
 from starjax.evaluation import protocol
 from starjax.evaluation.disturbances import DISTURBANCES
-from starjax.runtime import sources
 from starjax.sim import registries
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -29,8 +29,8 @@ PHYSICS = (
 )
 # Draws, measurements and success of each task. Experts and phrases are not part of it.
 JUDGES = (
-    *("sim/tasks/base.py", "sim/tasks/two_arms.py", "sim/collision.py", "evaluation/trials.py"),
-    *(f"sim/tasks/{name}/task.py" for name in protocol.TIME_LIMIT_S),
+    *("sim/task.py", "tasks/two_arms.py", "sim/collision.py", "evaluation/trials.py"),
+    *(f"tasks/{name}/task.py" for name in protocol.TIME_LIMIT_S),
 )
 # Robots and tools of the benchmark's tasks; other parts may come and change.
 PARTS_MJCF = ("arms/fr5", "tools/grasper", "tools/endoscope", "tools/endoscope30")

@@ -10,7 +10,7 @@ import pytest
 import stubs
 import synthetic
 
-from starjax import errors
+from starjax.core import errors
 from starjax.evaluation import result, trial_file
 from starjax.rollouts import trocars
 from starjax.runtime import provenance

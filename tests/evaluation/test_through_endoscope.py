@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import stubs
 
-from starjax import config
-from starjax.commands import demonstrations
+from starjax.cli import demonstrations
+from starjax.core import config
 from starjax.data import demos, load, schema
 from starjax.evaluation import evaluate, recorded
 from starjax.rollouts import agent

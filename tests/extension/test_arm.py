@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from starjax import errors
+from starjax.core import errors
 from starjax.sim import ik, mounts, registries, robot, scene
 
 EULER = 'euler="3.141592654 0 0"'  # of the flange

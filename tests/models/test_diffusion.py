@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax.models import diffusion, schedule
+from starjax.policies.models import diffusion, schedule
 
 SCHEDULE = schedule.cosine(100)
 

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax.learners import ENCODERS
-from starjax.models import encoders, layers, resnet, spatial_softmax
-from starjax.models.group_norm import GroupNorm
+from starjax.core.learners import ENCODERS
+from starjax.policies.models import encoders, layers, resnet, spatial_softmax
+from starjax.policies.models.group_norm import GroupNorm
 
 KEY = jax.random.key(0)
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax.models.group_norm import GroupNorm
+from starjax.policies.models.group_norm import GroupNorm
 
 
 def run(module, x, seed=0):

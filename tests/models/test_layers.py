@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax.models import layers
+from starjax.policies.models import layers
 
 
 def run(module, x, seed=0):

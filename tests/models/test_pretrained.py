@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from starjax.models import pretrained, resnet
+from starjax.policies.models import pretrained, resnet
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import numpy as np
 import optax
 import pytest
 
-from starjax.models import roll_net
+from starjax.policies.models import roll_net
 
 KEY = jax.random.key(0)
 MODULE = roll_net.RollNet(width=32, embed_dim=8)

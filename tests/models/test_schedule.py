@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from starjax.models import schedule
+from starjax.policies.models import schedule
 
 
 def alpha_bar_closed_form(k: int, steps: int) -> float:

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax.models import diffusion, encoders, kernels, roll_net, schedule, unet1d
-from starjax.models.kernels import packed_params, parallel_ddim, sampling_unet
+from starjax.policies.models import diffusion, encoders, kernels, roll_net, schedule, unet1d
+from starjax.policies.models.kernels import packed_params, parallel_ddim, sampling_unet
 
 pytestmark = pytest.mark.slow
 

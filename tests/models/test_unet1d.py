@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax.models import diffusion, layers, unet1d
+from starjax.policies.models import diffusion, layers, unet1d
 
 KEY = jax.random.key(0)
 

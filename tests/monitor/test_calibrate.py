@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from starjax import errors
-from starjax.monitor import calibrate, scores
+from starjax.core import errors
+from starjax.policies.monitor import calibrate, scores
 
 SETTINGS = scores.ScoreSettings(execute=8, control_hz=30.0, still=6)
 S, CLOCK = len(scores.NAMES), scores.NAMES.index("clock")

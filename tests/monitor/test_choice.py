@@ -5,7 +5,7 @@ import types
 import numpy as np
 import pytest
 
-from starjax.monitor import calibrate, scores
+from starjax.policies.monitor import calibrate, scores
 
 SETTINGS = scores.ScoreSettings(execute=8, control_hz=30.0, still=3)
 STILLNESS, CLOSURE, PROGRESS = map(scores.NAMES.index, ("stillness", "closure", "progress"))

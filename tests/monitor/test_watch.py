@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from starjax.monitor import calibrate, scores, watch
+from starjax.policies.monitor import calibrate, scores, watch
 
 SETTINGS = scores.ScoreSettings(execute=8, control_hz=30.0, still=6)
 HORIZON, S = 16, len(scores.NAMES)

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax import config, rcm
+from starjax import rcm
+from starjax.core import config
+from starjax.core.methods import METHODS
 from starjax.data import normalizer, windows
-from starjax.methods import METHODS
 from starjax.policies import execution, features, generator
 from starjax.policies import policy as policies
 

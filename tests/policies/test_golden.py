@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax import config
+from starjax.core import config
+from starjax.core.methods import METHODS
 from starjax.data import normalizer, windows
-from starjax.methods import METHODS
 from starjax.policies import policy as policies
 
 GOLDEN = pathlib.Path(__file__).parents[1] / "golden"

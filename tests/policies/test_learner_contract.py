@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from starjax import errors
+from starjax.core import errors
 from starjax.policies import learner_contract
 from starjax.policies.sequences import SequenceModel, Sizes
 

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 import toy_learner
 
-from starjax import config, config_json, deploy, errors, learners, rcm
-from starjax.commands import options, run_settings
+from starjax import deploy, rcm
+from starjax.cli import options, run_settings
+from starjax.core import config, config_json, errors, learners
+from starjax.core.methods import METHODS
 from starjax.data import normalizer, windows
-from starjax.methods import METHODS
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
 from starjax.sim import registries
@@ -152,7 +153,7 @@ def test_settings_import_no_jax():
     program = """
 import sys
 from starjax import config, learners
-from starjax.commands import run_settings
+from starjax.cli import run_settings
 config.PolicyConfig()
 run_settings.parse("run", ["--preset", "cpu", "--out", "x"], "")
 assert not {"jax", "numpy", "mujoco"} & sys.modules.keys()

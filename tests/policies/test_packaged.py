@@ -10,11 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax import errors, methods, rcm
+from starjax import rcm
+from starjax.core import errors, methods
 from starjax.evaluation import latency
-from starjax.models.kernels import parallel_ddim
 from starjax.policies import features, packaged, policy_file
 from starjax.policies import policy as policies
+from starjax.policies.models.kernels import parallel_ddim
 from starjax.sim import registries
 
 MOST = 12e6  # bytes of a file

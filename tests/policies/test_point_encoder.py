@@ -9,7 +9,7 @@ import mistakes
 import numpy as np
 import pytest
 
-from starjax import methods
+from starjax.core import methods
 from starjax.data import augment
 from starjax.policies import features, generator, point_encoder
 from starjax.sim import derived_views

@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax import config, rcm
+from starjax import rcm
+from starjax.core import config
+from starjax.core.methods import METHODS
 from starjax.data import normalizer, windows
-from starjax.methods import METHODS
-from starjax.models import encoders, roll_net
-from starjax.models.kernels import packed_params, sampling_unet
 from starjax.policies import execution, features, generator, hierarchical
 from starjax.policies import policy as policies
+from starjax.policies.models import encoders, roll_net
+from starjax.policies.models.kernels import packed_params, sampling_unet
 
 STRAIGHT = [name for name, row in METHODS.items() if not row.has_wrist]  # others need a wrist
 TRAIN = config.TrainConfig(state_noise=0.0)

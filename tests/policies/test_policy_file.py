@@ -13,8 +13,8 @@ import safetensors
 import safetensors.numpy
 
 from starjax.data import normalizer
-from starjax.monitor import calibrate, scores
 from starjax.policies import packaged, policy_file
+from starjax.policies.monitor import calibrate, scores
 from starjax.sim import names
 
 POLICY = dataclasses.replace(fakes.TINY, crop_fraction=0.8)

@@ -8,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax import config, errors, rcm
+from starjax import rcm
+from starjax.core import config, errors
+from starjax.core.methods import METHODS
+from starjax.core.types import Pose
 from starjax.data import normalizer, windows
-from starjax.methods import METHODS
 from starjax.policies import execution, features, pose_hierarchy
 from starjax.policies import policy as policies
-from starjax.types import Pose
 
 WRIST = rcm.LARGE_NEEDLE_DRIVER
 TASK = fakes.task(slots=tuple(s._replace(tool="needle_driver") for s in fakes.TASK.slots))

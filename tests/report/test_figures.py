@@ -18,7 +18,7 @@ from starjax.report import (
     training_trocars,
     trajectories,
 )
-from starjax.sim.tasks.base import Outline
+from starjax.sim.task import Outline
 
 BOARD = np.array([[-0.05, -0.04, 0], [0.05, -0.04, 0], [0.05, 0.04, 0], [-0.05, 0.04, 0]])
 

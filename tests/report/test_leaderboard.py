@@ -6,8 +6,8 @@ import mistakes
 import pytest
 import synthetic
 
-from starjax import config, config_json
-from starjax.commands import leaderboard as command
+from starjax.cli import leaderboard as command
+from starjax.core import config, config_json
 from starjax.evaluation import protocol
 from starjax.report import leaderboard, leaderboard_tables
 from starjax.runtime import files

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import recorded
 
-from starjax.commands import inspect_page
+from starjax.cli import inspect_page
 from starjax.data import recordings
 from starjax.report import recording_figures, recording_page
 

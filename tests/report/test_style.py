@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from starjax import methods
+from starjax.core import methods
 from starjax.report import style
 
 # Draws a figure of every kind of element, light and dark, and prints the digest of its files.

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import stubs
 
-from starjax import errors, rcm
+from starjax import rcm
+from starjax.core import errors
+from starjax.core.types import Command, Pose
 from starjax.rollouts import agent, engine, episodes
-from starjax.types import Command, Pose
 
 CENTRE = stubs.trocars(11)
 
@@ -169,4 +170,4 @@ def test_each_program_is_traced_once():
     simulate = engine.make(env, policy, CENTRE, settings, episodes.SCORE)
     for group in ([(0, 0), (0, 1)], [(0, 2)]):
         assert len(list(simulate((params, jnp.float32(0.0)), group))) >= 1
-    assert len(traces) == 2  # for the shape of a plan, and for the program
+    assert len(traces) == 1

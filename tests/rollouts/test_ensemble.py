@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 import stubs
 
-from starjax import errors, rcm
+from starjax import rcm
+from starjax.core import errors
+from starjax.core.types import Command, Pose
 from starjax.rollouts import engine, ensemble, episodes
-from starjax.types import Command, Pose
 
 HORIZON, STEPS = 4, 7
 RNG = np.random.default_rng(0)

@@ -9,10 +9,10 @@ import pytest
 import stubs
 
 from starjax import rcm
+from starjax.core.types import Command, Pose
 from starjax.rollouts import agent, progress, takeover
 from starjax.sim import env as sim_env
-from starjax.sim.tasks.rescue import Rescuer
-from starjax.types import Command, Pose
+from starjax.sim.rescuer import Rescuer
 
 
 def stalls(rewards, steps=4, held=()):

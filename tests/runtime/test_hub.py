@@ -9,7 +9,7 @@ import mistakes
 import pytest
 import recorded
 
-from starjax.commands import inspect_command
+from starjax.cli import inspect_command
 from starjax.policies import packaged
 from starjax.runtime import hub
 

@@ -12,9 +12,8 @@ import sys
 
 import pytest
 
-from starjax import errors, learners
+from starjax.core import errors, learners, sources
 from starjax.evaluation.disturbances import DISTURBANCES
-from starjax.runtime import sources
 from starjax.sim import registries
 
 WHERE = pathlib.Path("dataset.json")
@@ -79,9 +78,9 @@ def test_packages_of_others_have_their_version(package):
 
 
 def test_code_of_a_task_is_that_of_its_modules_and_of_those_of_tasks_that_they_import():
-    files = {file.parent.name for file in sources._modules("starjax.sim.tasks.reach.task")}
+    files = {file.parent.name for file in sources._modules("starjax.tasks.reach.task")}
     assert files == {"reach", "tasks"} and not any(
-        file.name == "base.py" for file in sources._modules("starjax.sim.tasks.reach.task")
+        file.name == "base.py" for file in sources._modules("starjax.tasks.reach.task")
     )
 
 

@@ -321,7 +321,7 @@ class Node:
 
 
 def test_trees_survive_json():
-    part = importlib.import_module("starjax.types").Pose(1, (2, [3, None]))
+    part = importlib.import_module("starjax.core.types").Pose(1, (2, [3, None]))
     for tree in (part, Node({"b": 1, "a": ()}, "m"), [], 1, None, {"n": Node(Node(1))}):
         structure = jax.tree.structure(tree)
         assert tree_json.decode(tree_json.encode(structure)) == structure

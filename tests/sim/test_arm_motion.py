@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
+from starjax.core.types import Pose
 from starjax.sim import control, ik
-from starjax.types import Pose
 
 PERIOD = 1 / 30
 

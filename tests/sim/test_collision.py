@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+from starjax.core.types import Pose
 from starjax.sim import collision
-from starjax.sim.tasks.peg_transfer import task
-from starjax.types import Pose
+from starjax.tasks.peg_transfer import task
 
 UP = jnp.full((6, 3), 0.5)  # joints of an arm that is nowhere near
 DOWN = jnp.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, -1.0]])

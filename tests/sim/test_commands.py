@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from starjax import rcm
-from starjax.types import Command, Pose
+from starjax.core.types import Command, Pose
 
 LANES = 12
 NOMINAL = rcm.Trocar(*(np.full(LANES, x, np.float32) for x in (0.0, np.pi / 2, 0.0)))

@@ -10,12 +10,13 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from starjax import errors, rcm
-from starjax.commands import check_command
+from starjax import rcm
+from starjax.cli import check_command
+from starjax.core import errors
+from starjax.core.types import Agent, Pose
 from starjax.sim import contract, scene, task_draws
-from starjax.sim.tasks.base import Capsules
+from starjax.sim.task import Capsules
 from starjax.testing import tasks as checks
-from starjax.types import Agent, Pose
 
 SITE = pathlib.Path(__file__).parents[1] / "extension" / "site"
 A = jnp.zeros

@@ -8,7 +8,7 @@ import pytest
 
 from starjax.sim import coupling, physics
 from starjax.sim import scene as scenes
-from starjax.sim.tasks.base import Coupling
+from starjax.sim.task import Coupling
 
 GRIPPER = -jnp.ones(1)
 

@@ -7,13 +7,13 @@ import mujoco
 import numpy as np
 import pytest
 
+from starjax.core.types import Pose
 from starjax.data import augment
 from starjax.evaluation.disturbances import DISTURBANCES, base
 from starjax.policies import features
 from starjax.sim import derived_views, env, render, scene
 from starjax.sim.camera import tissue
 from starjax.sim.state import EnvParams
-from starjax.types import Pose
 
 SIZE = 32
 VIEWS = ("camera", "camera_right", "camera_depth", "endoscope_tissue")

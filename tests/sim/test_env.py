@@ -6,12 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax import errors, rcm
+from starjax import rcm
+from starjax.core import errors
+from starjax.core.types import Command, Pose
 from starjax.sim import dynamics, physics
 from starjax.sim import env as envs
-from starjax.sim.tasks import scripting
-from starjax.sim.tasks.peg_transfer import expert, task
-from starjax.types import Command, Pose
+from starjax.tasks import scripting
+from starjax.tasks.peg_transfer import expert, task
 
 STEPS = 330  # control steps: 11 s, longer than the expert takes
 

@@ -6,10 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from starjax import errors
+from starjax.core import errors
+from starjax.core.types import Pose
 from starjax.sim import assets, ik
 from starjax.sim.chain import chain_of
-from starjax.types import Pose
 
 FR5_HOME = (-0.18, -1.10, 1.90, -2.36, -1.571, 0.0)
 WEIGHT = 0.3

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from starjax.sim import physics, solver
-from starjax.sim.tasks.peg_transfer import task
+from starjax.tasks.peg_transfer import task
 
 REST_SECONDS = 10.0
 # How far a resting block may creep in that time (m): 0.23 mm in float32, 0 in float64.

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax.sim.tasks.peg_transfer import task
-from starjax.types import Pose
+from starjax.core.types import Pose
+from starjax.tasks.peg_transfer import task
 
 PEG = jnp.array([0.02, 0.0])
 

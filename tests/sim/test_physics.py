@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import pytest
 
 from starjax.sim import physics
-from starjax.sim.tasks.base import Contacts
-from starjax.sim.tasks.peg_transfer import task
+from starjax.sim.task import Contacts
+from starjax.tasks.peg_transfer import task
 
 
 @pytest.mark.parametrize(

@@ -12,13 +12,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from starjax import errors, rcm
+from starjax import rcm
+from starjax.core import errors
+from starjax.core.types import Pose
 from starjax.sim import render
 from starjax.sim import scene as model
 from starjax.sim.arms import fr5
 from starjax.sim.camera import geometry as scenes
 from starjax.sim.camera import rays, tiles
-from starjax.types import Pose
 
 # Every primitive, tilted, in a pile, with what must not be drawn: groups 3 and up, alpha 0, sites.
 PILE = """

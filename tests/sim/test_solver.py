@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import scipy.optimize
 
+from starjax.core.types import Command
 from starjax.sim import assets, dynamics, linear, registries, scene, solver
 from starjax.sim import env as envs
 from starjax.sim.quiet_mjx import mjx
-from starjax.types import Command
 
 GOLDEN = pathlib.Path(__file__).parents[1] / "golden"
 VELOCITIES, LIMITS, CONTACTS = 6, 3, 4

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from starjax import rcm
+from starjax.core.types import Command, Pose
 from starjax.sim import collision, control, dynamics, physics, wrist_motion
 from starjax.sim import env as envs
-from starjax.sim.tasks.base import CONTROL_HZ, Capsules
-from starjax.types import Command, Pose
+from starjax.sim.task import CONTROL_HZ, Capsules
 
 WRIST = rcm.LARGE_NEEDLE_DRIVER
 PERIOD = 1.0 / CONTROL_HZ

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from starjax import rcm
+from starjax.core.types import Agent, Command, Pose
 from starjax.sim import registries, scene, wrists
-from starjax.sim.tasks import rescue
-from starjax.types import Agent, Command, Pose
+from starjax.sim import rescuer as rescue
 
 REACH = registries.tasks.get("reach")
 # Of no package, so its wrist is that of the record.

@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax import methods, rcm
-from starjax.commands import presets
-from starjax.learners import ENCODERS
-from starjax.models.encoders import Trunk
+from starjax import rcm
+from starjax.cli import presets
+from starjax.core import methods
+from starjax.core.learners import ENCODERS
 from starjax.policies.external import POLICIES, ExternalPolicy
+from starjax.policies.models.encoders import Trunk
 from starjax.rcm import actions
 from starjax.sim import registries
 from starjax.testing import action_spaces, base, encoders

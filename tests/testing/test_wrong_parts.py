@@ -12,15 +12,15 @@ import pytest
 from starjax import rcm, testing
 from starjax.addons.formats import base as formats
 from starjax.addons.formats import part_check as format_check
+from starjax.core.learners import Learner
 from starjax.evaluation.disturbances import DISTURBANCES
 from starjax.evaluation.expert import ExpertEpisodes
-from starjax.learners import Learner
-from starjax.models.encoders import Trunk
 from starjax.policies.external import ExternalPolicy
+from starjax.policies.models.encoders import Trunk
 from starjax.policies.sequences import SequenceModel, observation_vector
 from starjax.sim import env as envs
 from starjax.sim import registries
-from starjax.sim.tasks.base import Field
+from starjax.sim.task import Field
 from starjax.testing import disturbances as disturbance_checks
 from starjax.testing import kinds, task_starts
 from starjax.testing import tasks as task_checks

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import fakes
 
-from starjax import config
-from starjax.methods import METHODS
+from starjax.core import config
+from starjax.core.methods import METHODS
 
 SETTINGS = config.TrainConfig(
     steps=12,
@@ -79,8 +79,8 @@ def _quadratic_policy():
     import jax
     import jax.numpy as jnp
 
+    from starjax.core.types import Command
     from starjax.policies.base import Policy
-    from starjax.types import Command
 
     def say(params, observation):
         p, weights = observation.pose.p[:, -1:], params["learner"]
@@ -112,7 +112,7 @@ def devices_main(count: int, out: str, observation: str, dtype: str) -> None:
     import numpy as np
 
     from starjax.data import windows
-    from starjax.models.kernels import packed_params
+    from starjax.policies.models.kernels import packed_params
     from starjax.training import sharding
     from starjax.training.state import step_keys
 
@@ -135,7 +135,7 @@ def processes_main(out: str, asks: int) -> None:
 
     import jax
 
-    from starjax.models.kernels import packed_params
+    from starjax.policies.models.kernels import packed_params
     from starjax.runtime import processes
     from starjax.training import devices, loop, sharding
 
@@ -191,7 +191,7 @@ def run_main(out: str, mode: str) -> None:
     import stubs
 
     from starjax import cli
-    from starjax.commands import demonstrations, pipeline, policy_evaluation
+    from starjax.cli import demonstrations, pipeline, policy_evaluation
     from starjax.policies import policy as policies
     from starjax.runtime import processes
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from starjax.models import encoders
 from starjax.policies import generator, packaged, policy_file
+from starjax.policies.models import encoders
 from starjax.training import encoder
 
 IMAGE = dataclasses.replace(fakes.TINY, observation="image")

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import stubs
 
-from starjax import config
-from starjax.commands import demonstrations, folders, pipeline, presets
+from starjax.cli import demonstrations, folders, pipeline, presets
+from starjax.core import config
+from starjax.core.methods import METHODS
 from starjax.data import load, normalizer, redraw, windows
-from starjax.methods import METHODS
 from starjax.policies import generator, policy_file
 from starjax.policies import policy as policies
 from starjax.rollouts import sharing

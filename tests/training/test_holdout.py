@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from starjax import rcm
+from starjax.core.types import Command, Pose
 from starjax.policies.base import Policy
 from starjax.training import holdout
-from starjax.types import Command, Pose
 
 
 def test_the_average_is_what_is_judged():

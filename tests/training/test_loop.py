@@ -19,9 +19,9 @@ import mistakes
 import numpy as np
 import pytest
 
+from starjax.core.methods import METHODS
 from starjax.data import windows
-from starjax.methods import METHODS
-from starjax.models.kernels import packed_params
+from starjax.policies.models.kernels import packed_params
 from starjax.runtime import files, precompile, signals
 from starjax.training import checkpoint, log, loop, state, step, stepper
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import mistakes
 import pytest
 
-from starjax import config
+from starjax.core import config
 from starjax.training import metrics
 
 SETTINGS = config.TrainConfig(log_every=3)

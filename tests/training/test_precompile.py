@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from starjax.core.methods import METHODS
 from starjax.data import windows
-from starjax.methods import METHODS
 from starjax.policies import features
 from starjax.training import loop, precompile, stepper
 

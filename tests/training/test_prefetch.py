@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax import config
+from starjax.core import config
 from starjax.data import windows
 from starjax.training import devices, prefetch, state
 from starjax.training.sharding import StateLayout

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 import several
 
-from starjax import config
-from starjax.commands import pipeline
+from starjax.cli import pipeline
+from starjax.core import config
 from starjax.data import store
 from starjax.evaluation import result
 from starjax.runtime import processes
@@ -222,7 +222,7 @@ def test_a_process_whose_others_do_not_come_ends_in_a_line():
 DIFFERENT = """
 import os, pathlib, sys
 from starjax import cli
-from starjax.commands import session
+from starjax.cli import session
 index = os.environ["JAX_PROCESS_ID"]
 
 def command(argv):

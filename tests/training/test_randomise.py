@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 import stubs
 
-from starjax import config, config_json
-from starjax.commands import pipeline
+from starjax.cli import pipeline
+from starjax.core import config, config_json
+from starjax.core.types import Command, Observation, Pose
 from starjax.data import windows
 from starjax.evaluation.disturbances import base, parse_levels
 from starjax.sim.state import EnvParams
 from starjax.training import randomise
-from starjax.types import Command, Observation, Pose
 
 KEY = jax.random.key(5)
 LEVELS = {"darkness": 0.5, "tint": 0.4, "smoke": 0.5, "blood": 0.2, "blur": 2.0, "noise": 0.1}

@@ -13,16 +13,16 @@ import mistakes
 import numpy as np
 import pytest
 
-from starjax import config
+from starjax.core import config
+from starjax.core.methods import METHODS
+from starjax.core.types import Pose
 from starjax.data import redraw, windows
 from starjax.evaluation.disturbances import base
-from starjax.methods import METHODS
 from starjax.policies.base import Policy
 from starjax.sim.render import CameraImage
 from starjax.sim.state import ImageSource
 from starjax.training import devices, loop, prefetch, randomise, redrawing, state, step, stepper
 from starjax.training.sharding import StateLayout
-from starjax.types import Pose
 
 NOTHING: Any = None
 KEY, SIZE, BATCH, MOVED = jax.random.key(4), 4, 16, 4

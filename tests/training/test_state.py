@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import optax
 import pytest
 
-from starjax import config
-from starjax.models import kernels
-from starjax.models.kernels import packed_params
+from starjax.core import config
+from starjax.policies.models import kernels
+from starjax.policies.models.kernels import packed_params
 from starjax.training import state
 
 

@@ -15,12 +15,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from starjax import config, runtime
-from starjax.commands import policy_args, policy_evaluation
+from starjax import runtime
+from starjax.cli import policy_args, policy_evaluation
+from starjax.core import config
+from starjax.core.types import Command
 from starjax.sim import registries
 from starjax.sim.env import Env
-from starjax.sim.tasks import phases, scripting
-from starjax.types import Command
+from starjax.tasks import phases, scripting
 
 LAST = 0.005  # m before a grasp
 SWITCHES = ("none", "jaws", "tips")
@@ -83,7 +84,7 @@ def goes_in(memory: Any, env: Env) -> jax.Array:
     """True `[A]` for tools on their way in to a grasp."""
     if env.task.arms == 1:
         return (memory.phase == phases.DESCEND)[None]
-    play = importlib.import_module(f"starjax.sim.tasks.{env.task.name}.expert").PLAY
+    play = importlib.import_module(f"starjax.tasks.{env.task.name}.expert").PLAY
     return jnp.asarray(play.looks)[memory.phase]
 
 

@@ -24,9 +24,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm, runtime
+from starjax.core.types import Pose
 from starjax.sim import registries
-from starjax.sim.tasks.needle_pick import task as pick
-from starjax.types import Pose
+from starjax.tasks.needle_pick import task as pick
 
 TOOL = registries.tools.get("needle_driver")
 P_WORLD_REF = np.array([0.0, 0.0, 0.15], np.float32)  # m

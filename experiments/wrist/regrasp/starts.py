@@ -22,7 +22,7 @@ import numpy as np
 from starjax import rcm, runtime
 from starjax.addons.suture.needle_regrasp import expert, task
 from starjax.sim import registries, sampling, scene
-from starjax.sim.tasks.wrist_script import WRIST
+from starjax.tasks.wrist_script import WRIST
 
 SEED, ARM = 2026, "psm"
 TOOL = registries.tools.get("needle_driver")

@@ -21,7 +21,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from starjax import errors
+from starjax.core import errors
 from starjax.data import schema, store, windows
 from starjax.data.schema import DemoSettings
 from starjax.rcm.trocar import Trocar

@@ -8,13 +8,14 @@ from typing import Any, Literal, NamedTuple
 import jax
 import numpy as np
 
-from starjax import errors, rcm
+from starjax import rcm
+from starjax.core import errors
+from starjax.core.types import Command, Observation, Pose
 from starjax.data import redraw, schema, store, windows
 from starjax.data.episode_array import EpisodeArray
 from starjax.data.placed_images import JoinedImages
 from starjax.rollouts import episodes
 from starjax.runtime import files, xla
-from starjax.types import Command, Observation, Pose
 
 Residency = Literal["auto", "device", "host", "disk"]
 

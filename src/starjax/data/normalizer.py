@@ -18,10 +18,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import errors, methods, rcm
+from starjax import rcm
+from starjax.core import errors, methods
 from starjax.data import windows
 from starjax.sim import wrists
-from starjax.sim.tasks.base import Field, Task
+from starjax.sim.task import Field, Task
 
 _SMALLEST_RANGE = 1e-4  # m or rad: below it an entry counts as constant, and is only centred
 # Action spaces whose positions are the world's, at every trocar.

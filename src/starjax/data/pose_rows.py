@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from starjax.errors import UsageError
+from starjax.core.errors import UsageError
 
 COLUMNS = 8  # for an arm
 ACTIONS = ("pose", "rcm4")  # columns of the actions

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import errors
+from starjax.core import errors
 from starjax.data import schema
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import episodes, programs, workers

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from starjax import errors
+from starjax.core import errors, sources
 from starjax.data import store
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import episodes, programs
-from starjax.runtime import jax_settings, sources, xla
+from starjax.runtime import jax_settings, xla
 from starjax.sim import registries
 
 IMPORTED_FILES = "imported_files.json"  # bytes and time of each file of others

@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from starjax.core.types import Command, Pose
 from starjax.data.windows import Dataset
-from starjax.types import Command, Pose
 
 TIP, AXIS, JAW = 5e-5, float(np.deg2rad(0.05)), 0.005  # m, rad and opening that count as motion
 MOST = 4  # control steps that an expert stands still, before the task's judge begins to settle

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from starjax import errors
-from starjax.runtime import files, sources, xla
+from starjax.core import errors, sources
+from starjax.runtime import files, xla
 
 SCHEMA = 2
 _KEY = re.compile(r"\d{4,}-\d{4,}-\d+")  # what `key` gives

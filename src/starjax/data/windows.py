@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
-from starjax.types import Command, Observation
+from starjax.core.types import Command, Observation
 
 _CHUNK = 1 << 13
 

@@ -1,5 +1,6 @@
 """Trained policies in other programs: in this process (`load`) or over a socket (`Client`)."""
 
+from starjax.core.types import Command, Pose
 from starjax.deploy.client import Client
 from starjax.deploy.guard import Doubt, Tolerances
 from starjax.deploy.images import square
@@ -9,7 +10,6 @@ from starjax.deploy.inputs import RobotObservation as Observation
 from starjax.deploy.plan_executor import Limits, Report
 from starjax.deploy.policy import Deployed, load
 from starjax.deploy.robot import Robot
-from starjax.types import Command, Pose
 
 __all__ = [
     "FARTHEST",

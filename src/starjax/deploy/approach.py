@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 
 from starjax import rcm
+from starjax.core.types import Command, Pose
 from starjax.data import normalizer
 from starjax.deploy import turns
 from starjax.rcm import arrays
-from starjax.types import Command, Pose
 
 # The packaged policy's first commands are at most 2.8 mm and 0.14 rad from the measured pose (110
 # inferences of four simulated trials): such a plan needs no approach. The default bounds are three

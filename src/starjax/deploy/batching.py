@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import rcm, types
+from starjax import rcm
+from starjax.core import types
+from starjax.core.errors import UsageError
 from starjax.deploy import inputs, wire
 from starjax.deploy.policy import Deployed
-from starjax.errors import UsageError
 from starjax.rcm import arrays
 from starjax.sim import trocar_region
 

@@ -13,14 +13,14 @@ import jax
 import numpy as np
 
 from starjax import rcm
+from starjax.core.errors import UsageError
+from starjax.core.types import Command, Pose
 from starjax.deploy import greeting, guard, trocar_inputs, wire
 from starjax.deploy.connection import Connection
 from starjax.deploy.inputs import RobotObservation
 from starjax.deploy.plan_executor import LIMITS, Limits, PlanExecutor, Report
 from starjax.deploy.robot import Robot
-from starjax.errors import UsageError
-from starjax.monitor.watch import Watch
-from starjax.types import Command, Pose
+from starjax.policies.monitor.watch import Watch
 
 TIMEOUT_S = 1.0  # for a reply, and for a connection attempt
 WAIT_S = 10.0  # for the first connection

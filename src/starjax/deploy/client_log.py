@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from starjax import errors
+from starjax.core import errors
 
 _MAX_LINES = 5  # refusals of one client in the log; the others are counted
 _MAX_TEXT = 200  # characters

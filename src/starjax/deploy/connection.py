@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import websockets
 from websockets.sync import client as sockets
 
+from starjax.core.errors import UsageError
 from starjax.deploy import wire
-from starjax.errors import UsageError
 
 _FIRST_WAIT_S, _MAX_WAIT_S = 0.05, 1.0  # between two attempts to connect; doubles
 _POLL_S = 0.05  # between two checks of an idle connection

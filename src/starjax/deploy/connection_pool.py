@@ -7,8 +7,8 @@ from typing import Any
 import websockets
 from websockets.sync import client as sockets
 
+from starjax.core.errors import UsageError
 from starjax.deploy import wire
-from starjax.errors import UsageError
 
 TIMEOUT_S = 120.0  # for an answer: a server may compile at the first request
 CONNECT_S = 10.0

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from starjax import errors
+from starjax.core import errors, sources
 from starjax.deploy import connection_pool, served
 from starjax.policies.external import POLICIES, ExternalPolicy
-from starjax.runtime import sources, user_code
+from starjax.runtime import user_code
 
 
 class LocalConnection:

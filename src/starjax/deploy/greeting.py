@@ -5,14 +5,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from starjax import config, config_json, errors, limits, methods
+from starjax.core import config, config_json, errors, limits, methods
+from starjax.core.errors import UsageError
 from starjax.data import pose_rows
 from starjax.deploy import wire
 from starjax.deploy.inputs import InputSpec
-from starjax.errors import UsageError
-from starjax.monitor import calibrate
+from starjax.policies.monitor import calibrate
 from starjax.sim import names
-from starjax.sim.tasks.base import CONTROL_HZ
+from starjax.sim.task import CONTROL_HZ
 
 MAX_CONNECTIONS = 64
 _MAX_HORIZON = 1024  # control steps of a plan

@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from starjax.types import Pose
+from starjax.core.types import Pose
 
 MAX_OFF_TROCAR = 0.003  # m, from the measured shaft to the trocar: beyond, its wall would be pushed
 MAX_FOLLOWING = 0.004  # m, from the measured tip to the nearest of the last commands

@@ -3,7 +3,7 @@
 import numpy as np
 from PIL import Image
 
-from starjax.errors import UsageError
+from starjax.core.errors import UsageError
 
 LARGEST = (480, 640)  # pixels of an image of a request, as 4-byte numbers
 

@@ -8,13 +8,13 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
+from starjax.core.errors import UsageError
 from starjax.deploy import batching, server, wire
 from starjax.deploy.client import Client
 from starjax.deploy.connection import Reply
 from starjax.deploy.plan_executor import Report
 from starjax.deploy.policy import Deployed
 from starjax.deploy.robot import Robot
-from starjax.errors import UsageError
 
 
 def drive(

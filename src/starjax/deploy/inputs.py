@@ -13,12 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import core
 
-from starjax import rcm, types
+from starjax import rcm
+from starjax.core import types
+from starjax.core.errors import UsageError
+from starjax.core.types import Pose
 from starjax.deploy import guard
 from starjax.deploy.guard import MAX_SKEW
-from starjax.errors import UsageError
 from starjax.sim import trocar_region
-from starjax.types import Pose
 
 FARTHEST = 0.5  # m, from the nominal trocar to a trocar or a tip: beyond, the unit is mm
 MAX_BEND = 0.2  # rad beyond the limits of a wrist: the error of a measured trocar is less

@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from starjax import config, rcm
+from starjax import rcm
+from starjax.core import config
+from starjax.core.errors import UsageError
+from starjax.core.types import Command, Pose
 from starjax.data import pose_rows
 from starjax.deploy.inputs import InputSpec, RobotObservation, image_of, trocar_position
-from starjax.errors import UsageError
 from starjax.sim import env as sim_env
-from starjax.sim.tasks.base import Task
-from starjax.types import Command, Pose
+from starjax.sim.task import Task
 
 MAX_HORIZON = 4096
 _WIDTH = {"pose": pose_rows.COLUMNS, "rcm4": rcm.ACTION_SPACES["rcm4"].dim + 1}  # for an arm

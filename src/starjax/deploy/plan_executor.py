@@ -19,10 +19,10 @@ import jax
 import numpy as np
 
 from starjax import rcm
+from starjax.core.errors import UsageError
+from starjax.core.types import Command, Pose
 from starjax.deploy import plan_motion
-from starjax.errors import UsageError
-from starjax.sim.tasks.base import CONTROL_HZ
-from starjax.types import Command, Pose
+from starjax.sim.task import CONTROL_HZ
 
 MAX_OFF = 1e-4  # m, from a plan's axes to the trocar: the networks' plans are off by 1e-8
 MAX_SKEW = 1e-3  # deviation of a plan's matrices from rotations

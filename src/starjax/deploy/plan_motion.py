@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 
 from starjax import rcm
+from starjax.core.types import Pose
 from starjax.deploy import turns
 from starjax.rcm import arrays
-from starjax.types import Pose
 
 _TINY = 1e-9  # m and rad, against a division by zero
 

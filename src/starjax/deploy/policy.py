@@ -14,18 +14,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import config, errors, methods, rcm, types
+from starjax import rcm
+from starjax.core import config, errors, methods, types
+from starjax.core.types import Command, Pose
 from starjax.data import normalizer
 from starjax.deploy import approach, guard, inputs, random_keys
 from starjax.deploy.inputs import RobotObservation
-from starjax.monitor.calibrate import Monitor
 from starjax.policies import packaged, policy_file, sampling
 from starjax.policies import policy as policies
+from starjax.policies.monitor.calibrate import Monitor
 from starjax.rcm import arrays
 from starjax.runtime import files, precompile
 from starjax.sim import registries, trocar_region, wrists
 from starjax.sim.names import SceneNames
-from starjax.types import Command, Pose
 
 _BOUNDS = ("max_first_move", "max_first_turn", "max_off_trocar")
 

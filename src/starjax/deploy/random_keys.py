@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import errors
+from starjax.core import errors
 
 
 def check(key: Any) -> None:

@@ -9,10 +9,11 @@ import jax
 import numpy as np
 from jax.experimental import io_callback
 
-from starjax import rcm, types
+from starjax import rcm
+from starjax.core import types
+from starjax.core.errors import UsageError
+from starjax.core.types import Command, Pose
 from starjax.deploy import connection_pool, greeting, inputs
-from starjax.errors import UsageError
-from starjax.types import Command, Pose
 
 
 class RemotePolicy:

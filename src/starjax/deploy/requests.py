@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from starjax.core.errors import UsageError
 from starjax.data import pose_rows
 from starjax.deploy import images, wire
 from starjax.deploy.inputs import InputSpec
-from starjax.errors import UsageError
 
 _IGNORED = ("prompt",)
 _PLAIN = "observation/"

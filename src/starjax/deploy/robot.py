@@ -2,8 +2,8 @@
 
 from typing import Protocol
 
+from starjax.core.types import Command
 from starjax.deploy.inputs import RobotObservation
-from starjax.types import Command
 
 
 class Robot(Protocol):

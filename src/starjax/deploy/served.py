@@ -8,17 +8,18 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from starjax import config, config_json, rcm
+from starjax import rcm
+from starjax.core import config, config_json
+from starjax.core.errors import UsageError
+from starjax.core.types import Command
 from starjax.deploy import batching, connection_pool, greeting, inputs, plain, remote_policy, wire
-from starjax.errors import UsageError
-from starjax.monitor.calibrate import Monitor
 from starjax.policies import in_env
 from starjax.policies.base import Policy
+from starjax.policies.monitor.calibrate import Monitor
 from starjax.rollouts import agent
 from starjax.sim import env as sim_env
 from starjax.sim import wrists
-from starjax.sim.tasks.base import Task
-from starjax.types import Command
+from starjax.sim.task import Task
 
 _NEAR_M = 1e-3  # between nominal trocars of server and task
 

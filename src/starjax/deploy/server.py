@@ -20,12 +20,12 @@ import websockets
 from websockets.asyncio import server as sockets
 
 import starjax
+from starjax.core.errors import UsageError
 from starjax.deploy import batching, client_log, requests, wire
 from starjax.deploy.policy import Deployed
-from starjax.errors import UsageError
-from starjax.monitor import calibrate
+from starjax.policies.monitor import calibrate
 from starjax.runtime import connections
-from starjax.sim.tasks.base import CONTROL_HZ
+from starjax.sim.task import CONTROL_HZ
 
 _POLL_S = 0.1  # between two calls of `should_stop`
 _MAX_ERROR = 2000  # characters

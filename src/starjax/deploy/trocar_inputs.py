@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from starjax import rcm
+from starjax.core.errors import UsageError
 from starjax.deploy.inputs import InputSpec, check_trocar
-from starjax.errors import UsageError
 
 
 def read(trocar: Any, spec: InputSpec) -> rcm.Trocar:

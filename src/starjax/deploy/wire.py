@@ -13,12 +13,12 @@ import msgpack
 import numpy as np
 
 from starjax import rcm
+from starjax.core.errors import UsageError
+from starjax.core.types import Command, Pose
 from starjax.data import pose_rows
 from starjax.deploy import images
 from starjax.deploy.inputs import InputSpec, RobotObservation, image_of
-from starjax.errors import UsageError
 from starjax.sim import trocar_region
-from starjax.types import Command, Pose
 
 PROTOCOL = 2
 _TYPES = ("|b1", "|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8")

@@ -18,13 +18,14 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from starjax import errors, rcm
+from starjax import rcm
+from starjax.core import errors
+from starjax.core.types import Command, Pose
 from starjax.data import pose_rows
 from starjax.data.pose_rows import ACTIONS
 from starjax.envs import batch, forked, mdp, settings, vector
 from starjax.sim import wrists
-from starjax.sim.tasks.base import Task
-from starjax.types import Command, Pose
+from starjax.sim.task import Task
 
 _WIDTH = {"pose": pose_rows.COLUMNS, "rcm4": rcm.ACTION_SPACES["rcm4"].dim + 1}
 _MATRIX = 13  # numbers of an arm in the compiled program: p, R, gripper

@@ -2,7 +2,7 @@
 
 import os
 
-from starjax.errors import UsageError
+from starjax.core.errors import UsageError
 from starjax.runtime import xla
 
 _was_started = False

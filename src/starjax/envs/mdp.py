@@ -23,10 +23,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from starjax import errors, extras, rcm
+from starjax import rcm
+from starjax.core import errors, extras
+from starjax.core.types import Command, Pose
 from starjax.envs import ranges, trocar_draws
 from starjax.envs.settings import WRIST_SPACES, EnvSettings
-from starjax.types import Command, Pose
 
 SHARE = 0.1  # part of half an action's range, in a control step: of a tip 0.15 m/s, as the arms can
 

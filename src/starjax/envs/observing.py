@@ -20,7 +20,7 @@ import numpy as np
 from starjax.envs import ranges
 from starjax.policies import features
 from starjax.sim import control
-from starjax.sim.tasks.base import Task
+from starjax.sim.task import Task
 
 LARGEST = 10.0  # numbers are clipped here
 _FASTEST = np.array([control.MAX_SPEED] * 3 + [control.MAX_SPIN], np.float32)

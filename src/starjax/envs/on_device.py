@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from starjax import errors
+from starjax.core import errors
 from starjax.envs import batch, vector
 
 ARRAYS = ("jax", "torch")

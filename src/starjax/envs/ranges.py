@@ -8,7 +8,7 @@ import numpy as np
 from starjax import rcm
 from starjax.envs.settings import WRIST_SPACES
 from starjax.sim import registries
-from starjax.sim.tasks.base import Task
+from starjax.sim.task import Task
 
 # Margins of the workspace's box of the tip (m) and of its rolls (rad): goals at the edge are inside
 # the range, and a command past the goal speeds the tool up.

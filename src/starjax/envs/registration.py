@@ -2,7 +2,7 @@
 
 import re
 
-from starjax import extras
+from starjax.core import extras
 from starjax.sim import registries
 
 VERSION = 0

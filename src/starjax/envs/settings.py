@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from starjax import errors, rcm
-from starjax.config import DEFAULT_TASK
+from starjax import rcm
+from starjax.core import errors
+from starjax.core.config import DEFAULT_TASK
 
 CONTROLS = ("relative", "absolute")
 WRIST_SPACES = ("rcm6", "se3_through")  # on the manifold, for tools with a wrist

@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import errors, rcm
+from starjax import rcm
+from starjax.core import errors
 from starjax.sim import sampling, trocar_region
-from starjax.sim.tasks.base import Task
+from starjax.sim.task import Task
 
 Draw = Callable[[jax.Array], rcm.Trocar]
 

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from starjax import errors
+from starjax.core import errors
 from starjax.envs import batch, forked, observing, settings
 
 METADATA = {"render_modes": ["rgb_array"], "render_fps": 30}

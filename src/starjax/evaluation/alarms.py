@@ -18,7 +18,7 @@ import numpy as np
 
 from starjax.evaluation import statistics
 from starjax.evaluation import trials as tables
-from starjax.monitor import calibrate, scores
+from starjax.policies.monitor import calibrate, scores
 from starjax.rollouts import plans
 from starjax.rollouts.episodes import Episode
 

@@ -20,18 +20,18 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from starjax import errors
+from starjax.core import errors, sources
 from starjax.data import schema
 from starjax.evaluation import alarms, recorded
 from starjax.evaluation import trials as tables
 from starjax.evaluation.disturbances import DISTURBANCES
-from starjax.monitor.scores import NAMES, ScoreSettings
+from starjax.policies.monitor.scores import NAMES, ScoreSettings
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import chunks, engine, episodes, plans, sharing, workers
 from starjax.rollouts import trocars as configurations
 from starjax.rollouts.agent import BatchAgent
 from starjax.rollouts.placement import DEFAULT_LAYOUT, DeviceLayout
-from starjax.runtime import files, jax_settings, sources, xla
+from starjax.runtime import files, jax_settings, xla
 from starjax.sim import endoscope_camera, registries
 
 # Trials together on a GPU, which takes hundreds in the time of one, as far as its memory goes.

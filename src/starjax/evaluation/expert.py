@@ -14,13 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
+from starjax.core.types import Agent, Command
 from starjax.data import stillness
 from starjax.evaluation import statistics
 from starjax.sim import collision, dynamics, ik, physics
 from starjax.sim import env as envs
 from starjax.sim import scene as scenes
 from starjax.sim.state import EnvState
-from starjax.types import Agent, Command
 
 CHUNK = {"cpu": 16}  # episodes at once
 CHUNK_GPU = 600

@@ -21,7 +21,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from starjax import errors, methods
+from starjax.core import errors, methods
 from starjax.evaluation import locate, result
 from starjax.evaluation.content import Trial
 

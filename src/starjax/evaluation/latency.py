@@ -9,14 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import config, methods, rcm
-from starjax.models import roll_net
+from starjax import rcm
+from starjax.core import config, methods
+from starjax.core.types import Observation
 from starjax.policies import features, generator
 from starjax.policies import policy as policies
+from starjax.policies.models import roll_net
 from starjax.runtime import precompile as precompile_lib
 from starjax.sim import wrists
-from starjax.sim.tasks.base import Field
-from starjax.types import Observation
+from starjax.sim.task import Field
 
 _WARM_UP = 3  # calls before the clock starts
 

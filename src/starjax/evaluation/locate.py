@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from starjax import errors
+from starjax.core import errors
 
 RESULT, SWEEP = "result.json", "sweep.json"
 

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from starjax import errors
+from starjax.core import errors
 from starjax.evaluation import statistics
 from starjax.evaluation.content import Trial
 

@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from starjax import learners
+from starjax.core import learners, sources
 from starjax.evaluation import protocol, structure, trial_file
 from starjax.evaluation.content import Evaluation, Sweep, Trial
 from starjax.evaluation.paired import paired as paired
-from starjax.runtime import files, jax_settings, provenance, sources, xla
+from starjax.runtime import files, jax_settings, provenance, xla
 from starjax.sim import names, registries
 
 SCHEMA = 2

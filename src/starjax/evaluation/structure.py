@@ -6,7 +6,7 @@ from typing import TypeVar
 
 import msgspec
 
-from starjax import errors
+from starjax.core import errors
 
 T = TypeVar("T")
 _PLACE = re.compile(r" - at `\$\.?(.*)`$")

@@ -6,12 +6,13 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
-from starjax import errors, rcm
+from starjax import rcm
+from starjax.core import errors
 from starjax.evaluation import statistics
 from starjax.evaluation import trials as tables
 from starjax.rcm.trocar import Trocar
 from starjax.sim import sampling
-from starjax.sim.tasks.base import Task
+from starjax.sim.task import Task
 
 BIN_WIDTH = 0.01  # m, of the distance to the nearest training trocar
 

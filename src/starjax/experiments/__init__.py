@@ -1,1 +1,1 @@
-"""Home of `python -m starjax.experiments.run`; the commands live in `starjax.commands`."""
+"""Home of `python -m starjax.experiments.run`; the commands live in `starjax.cli`."""

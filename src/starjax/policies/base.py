@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import jax
 
 from starjax import rcm
+from starjax.core.types import Command, Observation
 from starjax.data import normalizer, windows
 from starjax.policies.sequences import Params
-from starjax.types import Command, Observation
 
 __all__ = ["Params", "Policy"]
 

@@ -5,9 +5,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from starjax.models import diffusion, kernels, unet1d
-from starjax.models.process import Process
 from starjax.policies import sequences
+from starjax.policies.models import diffusion, kernels, unet1d
+from starjax.policies.models.process import Process
 from starjax.policies.sequences import Condition, Params, SequenceModel
 
 _MATRICES = {"kernel", "film_time", "film_cond"}

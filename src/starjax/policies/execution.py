@@ -3,10 +3,11 @@
 import jax
 import jax.numpy as jnp
 
-from starjax import methods, rcm
+from starjax import rcm
+from starjax.core import methods
+from starjax.core.types import Command
 from starjax.data import normalizer
 from starjax.policies import features
-from starjax.types import Command
 
 
 def command(

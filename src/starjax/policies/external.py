@@ -7,7 +7,7 @@ observation into commands, such as a vision-language-action model or a scripted 
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
-from starjax.registry import Registry
+from starjax.core.registry import Registry
 
 
 class ExternalPolicy(NamedTuple):

@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import config, methods, rcm
+from starjax import rcm
+from starjax.core import config, methods
+from starjax.core.types import Observation
 from starjax.data import augment, normalizer, windows
 from starjax.sim import names
-from starjax.sim.tasks.base import Task
-from starjax.types import Observation
+from starjax.sim.task import Task
 
 TROCAR_FEATURES = 7  # for each arm
 

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from starjax import config, errors, methods
-from starjax.learners import ENCODERS
-from starjax.models import encoders, kernels
+from starjax.core import config, errors, methods
+from starjax.core.learners import ENCODERS
 from starjax.policies import features, learner_contract, sequences
 from starjax.policies.base import Params
+from starjax.policies.models import encoders, kernels
 from starjax.policies.sequences import Condition, SequenceModel, Sizes
 from starjax.sim import names
 

@@ -10,11 +10,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from starjax import config, methods, rcm
+from starjax import rcm
+from starjax.core import config, methods
 from starjax.data import normalizer, windows
-from starjax.models import kernels
 from starjax.policies import execution, features, generator, hierarchy, path_network
 from starjax.policies.base import Params, Policy
+from starjax.policies.models import kernels
 
 # Noise on the roll network's inputs (standard deviation, normalised units): demonstrated positions
 # and rolls are exact, sampled and measured ones are not. It keeps small errors from accumulating,

@@ -5,12 +5,13 @@ from typing import NamedTuple
 
 import jax
 
-from starjax import config, methods, rcm
+from starjax import rcm
+from starjax.core import config, methods
+from starjax.core.types import Command, Observation
 from starjax.data import normalizer
-from starjax.models.diffusion import within
 from starjax.policies import features, generator, sequences
 from starjax.policies.base import Params
-from starjax.types import Command, Observation
+from starjax.policies.models.diffusion import within
 
 
 class Acting(NamedTuple):

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from starjax import config, errors, methods, rcm
+from starjax import rcm
+from starjax.core import config, errors, methods
 from starjax.data import normalizer
 from starjax.policies import policy as policies
 from starjax.policies import policy_file

@@ -6,8 +6,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from starjax import config, errors
-from starjax.learners import LEARNERS
+from starjax.core import config, errors
+from starjax.core.learners import LEARNERS
 from starjax.policies.sequences import Condition, SequenceModel, Sizes
 from starjax.runtime import user_code
 

@@ -13,7 +13,7 @@ import importlib.util
 import os
 from pathlib import Path
 
-from starjax import errors, extensions
+from starjax.core import errors, extensions
 from starjax.runtime import hub
 
 FOLDER = Path(__file__).with_name("weights")

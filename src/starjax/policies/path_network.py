@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from starjax import config
-from starjax.models import kernels, roll_net
+from starjax.core import config
 from starjax.policies import features, sequences
+from starjax.policies.models import kernels, roll_net
 
 
 class PathNetwork(NamedTuple):

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 
 from starjax.data import augment
-from starjax.models import layers
-from starjax.models.encoders import Trunk
+from starjax.policies.models import layers
+from starjax.policies.models.encoders import Trunk
 from starjax.sim import derived_views
 
 _CENTRE = 0.35  # m, middle of the depths of a view

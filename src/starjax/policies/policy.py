@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 
-from starjax import config, methods, rcm
+from starjax import rcm
+from starjax.core import config, methods
 from starjax.policies import features, hierarchical, pose_hierarchy, single
 from starjax.policies.base import Params, Policy
-from starjax.sim.tasks.base import Task
+from starjax.sim.task import Task
 
 __all__ = ["Params", "Policy", "ablated", "make"]
 

@@ -16,10 +16,10 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from starjax import config, config_json
+from starjax.core import config, config_json
 from starjax.data import normalizer
-from starjax.monitor import calibrate
 from starjax.policies.base import Params
+from starjax.policies.monitor import calibrate
 from starjax.runtime import files
 from starjax.sim import names
 

@@ -12,11 +12,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from starjax import config, methods, rcm
+from starjax import rcm
+from starjax.core import config, methods
 from starjax.data import normalizer, windows
-from starjax.models import kernels
 from starjax.policies import execution, features, generator, hierarchy, path_network
 from starjax.policies.base import Params, Policy
+from starjax.policies.models import kernels
 
 TURN = 0.3  # rad, standard deviation of the random turns, and the unit of the network's output
 MAX_TURN = 3.0  # units, of a correction

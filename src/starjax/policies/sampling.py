@@ -7,8 +7,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from starjax import config, config_json, errors, limits, methods
-from starjax.learners import LEARNERS
+from starjax.core import config, config_json, errors, limits, methods
+from starjax.core.learners import LEARNERS
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
 from starjax.sim import registries

@@ -4,12 +4,13 @@ from typing import Any, NamedTuple
 
 import jax
 
-from starjax import config, methods, rcm
+from starjax import rcm
+from starjax.core import config, methods
+from starjax.core.types import Command, Observation
 from starjax.data import normalizer, windows
-from starjax.models.diffusion import within
 from starjax.policies import execution, features, generator, sequences
 from starjax.policies.base import Params, Policy
-from starjax.types import Command, Observation
+from starjax.policies.models.diffusion import within
 
 
 class PreparedActions(NamedTuple):

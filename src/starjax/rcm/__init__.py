@@ -4,6 +4,7 @@
 >>> pose, valid = action_space.decode(action, trocar, p_world_ref)
 """
 
+from starjax.core.types import Pose
 from starjax.rcm.actions import ACTION_SPACES, MAX_REACH, ActionSpace
 from starjax.rcm.estimate import (
     MAX_RESIDUAL,
@@ -57,7 +58,6 @@ from starjax.rcm.wrist import (
     tip_of,
 )
 from starjax.rcm.wrist_actions import action_space, rcm6, se3_through, se3_wrist
-from starjax.types import Pose
 
 __all__ = [
     "ACTION_SPACES",

@@ -24,10 +24,10 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from starjax import types
+from starjax.core import types
+from starjax.core.registry import Registry, Rows
 from starjax.rcm import arrays, manifold, rotations
 from starjax.rcm import trocar as trocars
-from starjax.registry import Registry, Rows
 
 MAX_REACH = 10.0  # m; bound of a decoded SE(3) position's coordinates
 

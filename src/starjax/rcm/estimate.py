@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from starjax import types
+from starjax.core import types
 from starjax.rcm import arrays
 from starjax.rcm import wrist as wrists
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from starjax import types
+from starjax.core import types
 from starjax.rcm import arrays, rotations
 
 MIN_DEPTH = 0.005  # m; shallower poses are moved to this depth along the tool's axis

@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
+from starjax.core.types import Pose
 from starjax.rcm import arrays, manifold, rotations, wrist_checks
-from starjax.types import Pose
 
 _E_Z = np.array([0.0, 0.0, 1.0], np.float32)
 MAX_SKEW = 1e-3  # deviation of a requested matrix from a rotation

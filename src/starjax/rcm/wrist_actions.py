@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import errors
+from starjax.core import errors
+from starjax.core.types import Pose
 from starjax.rcm import actions, arrays, rotations, wrist_checks
 from starjax.rcm import wrist as wrists
-from starjax.types import Pose
 
 _E_X = np.array([1.0, 0.0, 0.0], np.float32)
 _E_Z = np.array([0.0, 0.0, 1.0], np.float32)

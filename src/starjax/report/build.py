@@ -5,7 +5,7 @@ import pathlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from starjax import errors, extensions, methods
+from starjax.core import errors, extensions, methods
 from starjax.report import (
     compare,
     figures,

@@ -3,13 +3,13 @@
 import collections
 from collections.abc import Iterable, Sequence
 
-from starjax import config_json, errors
+from starjax.core import config_json, errors
 from starjax.evaluation import paired
 from starjax.evaluation.result import Trial
 from starjax.report import outcomes
 from starjax.report.results import Run
 from starjax.sim import registries
-from starjax.sim.tasks.base import Task, TaskText
+from starjax.sim.task import Task, TaskText
 
 OURS = "stardiff"  # reference of the comparisons
 

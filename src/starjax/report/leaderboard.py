@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from starjax import errors
+from starjax.core import errors
 from starjax.evaluation import protocol
 from starjax.report import leaderboard_rows
 from starjax.report.leaderboard_rows import Row

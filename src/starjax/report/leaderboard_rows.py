@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from starjax import methods
+from starjax.core import methods
 from starjax.evaluation import protocol, result, structure
 from starjax.evaluation.disturbances import current_name
 from starjax.report import formats, outcomes, stats

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from starjax.report import formats, results
-from starjax.sim.tasks.base import TaskText
+from starjax.sim.task import TaskText
 
 CELL = "Successes/trials and the 95% Wilson interval in brackets."
 SUCCESS = (

@@ -8,7 +8,7 @@ from starjax import rcm
 from starjax.evaluation import sweep
 from starjax.evaluation.result import Trial
 from starjax.report import stats
-from starjax.sim.tasks.base import TaskText
+from starjax.sim.task import TaskText
 
 
 def tally(trials: Iterable[Trial], outcome: Callable[[Trial], bool] | None = None) -> stats.Rate:

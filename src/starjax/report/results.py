@@ -6,11 +6,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from starjax import errors, methods
+from starjax.core import errors, methods
+from starjax.core.types import Pose
 from starjax.evaluation import recorded
 from starjax.evaluation.result import Result, Trial, read
 from starjax.report import outcomes, sidecars
-from starjax.types import Pose
 
 
 class TrialTrajectory(NamedTuple):

@@ -11,11 +11,11 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from starjax.core.types import Pose
 from starjax.sim import registries, scene, still_bodies, thread_geoms
 from starjax.sim.camera import geometry
 from starjax.sim.names import SceneNames
-from starjax.sim.tasks.base import Outline
-from starjax.types import Pose
+from starjax.sim.task import Outline
 
 BATCH = 16  # images per call of the compiled program
 

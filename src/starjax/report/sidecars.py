@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 
-from starjax import config_json, methods
+from starjax.core import config_json, methods
 from starjax.evaluation import result, structure
 from starjax.evaluation.content import Hardware, Milliseconds
 from starjax.runtime import files

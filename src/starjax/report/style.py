@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from types import ModuleType
 from typing import Any
 
-from starjax import methods
+from starjax.core import methods
 from starjax.report import stats
 
 SUCCESS, FAILURE = "#2083C5", "#D55E00"

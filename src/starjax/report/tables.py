@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Callable, Sequence
 
-from starjax import methods
+from starjax.core import methods
 from starjax.evaluation import sweep
 from starjax.evaluation.paired import Paired
 from starjax.evaluation.result import Trial

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from starjax import methods
+from starjax.core import methods
 from starjax.report import compare, outcomes, results, stats, style
 
 

@@ -13,7 +13,7 @@ from starjax.evaluation import paired
 from starjax.report import compare, outcomes, results, style
 from starjax.report.scene_view import SceneView
 from starjax.sim.names import SceneNames
-from starjax.sim.tasks.base import Outline
+from starjax.sim.task import Outline
 
 Stages = Callable[[SceneNames], SceneView]
 

@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from starjax.core.types import Pose
 from starjax.evaluation import paired
 from starjax.evaluation.result import Result
 from starjax.report import compare, encode, outcomes, results, scene_view, style
 from starjax.rollouts import trial_key
 from starjax.sim.names import SceneNames
-from starjax.types import Pose
 
 SIZE = 384  # pixels, side of one rollout's images
 _BAR = 44  # pixels, height of the caption

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from starjax import errors
+from starjax.core import errors
+from starjax.core.types import Agent, Command, Observation
 from starjax.rollouts import placement
-from starjax.types import Agent, Command, Observation
 
 Observe = Callable[[], Observation]
 

@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from starjax import rcm
+from starjax.core.types import Command, Pose
 from starjax.rollouts import agent
-from starjax.types import Command, Pose
 
 DECAY = 0.01  # a control step, as in ACT
 

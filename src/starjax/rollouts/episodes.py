@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
+from starjax.core.types import Command, Observation, Pose
 from starjax.rcm.trocar import Trocar
-from starjax.types import Command, Observation, Pose
 
 Trial = tuple[int, int]  # index of the trocars' configuration, number there
 

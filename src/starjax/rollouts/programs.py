@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from starjax.core.types import Command
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import episodes, placement
 from starjax.rollouts.agent import BatchAgent
 from starjax.runtime import precompile
-from starjax.types import Command
 
 
 class Trials(NamedTuple):

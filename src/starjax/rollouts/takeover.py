@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from starjax.rollouts import episodes, placement, progress
 from starjax.rollouts.agent import BatchAgent, Observe
 from starjax.sim import wrists
-from starjax.sim.tasks.rescue import Rescuer
+from starjax.sim.rescuer import Rescuer
 
 POLICY, EXPERT, PERSON = range(3)  # values of the field `actor`, see `episodes.FIELDS`
 ACTOR, CAUSE = "actor", "cause"  # recorded fields, `[N]` uint8

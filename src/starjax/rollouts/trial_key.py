@@ -2,9 +2,9 @@
 
 import jax
 
+from starjax.core.types import Pose
 from starjax.sim import registries, scene
 from starjax.sim.names import SceneNames
-from starjax.types import Pose
 
 
 def of_trial(seed: int, trocar: int, trial: int, stream: int | None = None) -> jax.Array:

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from starjax import errors, rcm
+from starjax import rcm
+from starjax.core import errors
 from starjax.rcm.trocar import Trocar
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from websockets.asyncio import server as sockets
 
-from starjax.errors import UsageError
+from starjax.core.errors import UsageError
 
 HANDSHAKE_S = 5.0  # time to finish a handshake
 MAX_PAGES = 64  # connections to a page, several per tab

@@ -12,7 +12,7 @@ import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from starjax import errors, extras
+from starjax.core import errors, extras
 
 SCHEME = "hf://"
 _LIBRARY = "huggingface_hub"

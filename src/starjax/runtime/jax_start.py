@@ -8,7 +8,7 @@ import sys
 from typing import TextIO
 
 import starjax
-from starjax import errors
+from starjax.core import errors
 from starjax.runtime import background, notice
 
 # Number of this process in a run of several, as jax and srun name it.

@@ -182,7 +182,10 @@ def _folder() -> Path | None:
 def are_cached() -> bool:
     """Returns whether programs of this version were stored on this machine and device before."""
     folder = _folder()
-    return folder is not None and (folder / _sources(jax.local_devices()[0])).exists()
+    try:
+        return folder is not None and (folder / _sources(jax.local_devices()[0])).exists()
+    except package_files.Missing:  # parts of a script, of which no programs are stored
+        return False
 
 
 @functools.lru_cache(maxsize=8)

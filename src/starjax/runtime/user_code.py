@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from starjax import errors
+from starjax.core import errors
 
 
 def place(function: Any) -> str:

@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 
 from starjax import rcm
+from starjax.core.types import Command, Pose
 from starjax.sim import control, ik, wrist_motion
 from starjax.sim import scene as scenes
 from starjax.sim.state import EnvState
-from starjax.sim.tasks.base import CONTROL_HZ
-from starjax.types import Command, Pose
+from starjax.sim.task import CONTROL_HZ
 
 STEP_IK_ITERATIONS = 4
 # Largest entry of R'R - 1 of a command; float32 and rounded inputs stay far below.

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.spatial.transform import Rotation
 
-from starjax.sim.tasks.base import Contacts
-from starjax.types import Pose
+from starjax.core.types import Pose
+from starjax.sim.task import Contacts
 
 
 def free_pose(qpos: jax.Array, start: int) -> Pose:

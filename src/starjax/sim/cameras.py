@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from starjax.core.types import Pose
 from starjax.sim import derived_views, endoscope_camera, render
 from starjax.sim.camera import tissue
 from starjax.sim.quiet_mjx import mjx
-from starjax.types import Pose
 
 
 class SceneCamera(NamedTuple):

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from starjax import errors
+from starjax.core import errors
 from starjax.sim.ik import Chain
 
 

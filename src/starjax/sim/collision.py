@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 
 from starjax import rcm
+from starjax.core.types import Pose
 from starjax.sim.scene import BoundArm
-from starjax.sim.tasks.base import Capsules
-from starjax.types import Pose
+from starjax.sim.task import Capsules
 
 # Overlap that is called a collision (m): more than the soft contacts' own give.
 DEPTH = 0.0005

@@ -11,10 +11,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from starjax import errors
+from starjax.core import errors
+from starjax.core.types import Agent, Command, Pose
 from starjax.runtime import user_code
-from starjax.sim.tasks.base import Capsules, Outline, Task, TaskStatus
-from starjax.types import Agent, Command, Pose
+from starjax.sim.task import Capsules, Outline, Task, TaskStatus
 
 Fault = tuple[str, str] | None  # expected and got
 _SCALARS = {

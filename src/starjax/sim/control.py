@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from starjax import rcm
-from starjax.types import Pose
+from starjax.core.types import Pose
 
 # Limits of the tip (m/s, m/s^2) and of the roll about the axis (rad/s, rad/s^2). They are equal for
 # every arm, for equal motions under one policy; `Arm.max_speed` also bounds the joints. The FR5's

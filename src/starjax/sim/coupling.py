@@ -5,10 +5,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from starjax.core.types import Pose
 from starjax.sim import ik, wrist_motion
 from starjax.sim import scene as scenes
-from starjax.sim.tasks.base import StepReadings
-from starjax.types import Pose
+from starjax.sim.task import StepReadings
 
 
 def begin(

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from starjax.core.types import Pose
 from starjax.sim.camera import geometry, tissue
 from starjax.sim.names import DEPTH, TISSUE
-from starjax.types import Pose
 
 RIGHT = "_right"
 BASELINE = 0.005  # m between the lenses

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 
 from starjax import rcm
+from starjax.core.types import Command, Pose
 from starjax.sim import arm_motion, collision, ik, physics, solver
 from starjax.sim import scene as scenes
 from starjax.sim.state import EnvParams, EnvState
-from starjax.sim.tasks.base import CONTROL_HZ, SimReadings
-from starjax.types import Command, Pose
+from starjax.sim.task import CONTROL_HZ, SimReadings
 
 RESET_IK_ITERATIONS = 40
 # Energy (J) of the contact solver's error beyond which a step counts as diverged: it moves an arm's

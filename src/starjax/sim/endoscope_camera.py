@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from starjax.core.types import Pose
 from starjax.rcm import trocar as trocars
 from starjax.sim.names import TISSUE
-from starjax.types import Pose
 
 if TYPE_CHECKING:  # a robot loads tasks without the simulator
     import mujoco

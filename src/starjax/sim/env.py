@@ -12,15 +12,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from starjax import errors
-from starjax.config import DEFAULT_TASK, PolicyConfig
+from starjax.core import errors
+from starjax.core.config import DEFAULT_TASK, PolicyConfig
+from starjax.core.types import Observation
 from starjax.sim import cameras as views
 from starjax.sim import dynamics, endoscope_camera, physics, render, thread_geoms
 from starjax.sim import scene as scenes
 from starjax.sim.names import SceneNames
 from starjax.sim.state import Env, EnvParams, EnvState, ImageSource
-from starjax.sim.tasks.base import CONTROL_HZ, Task
-from starjax.types import Observation
+from starjax.sim.task import CONTROL_HZ, Task
 
 __all__ = [
     "CONTROL_HZ",

@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from starjax.core.types import Pose
 from starjax.sim import linear
-from starjax.types import Pose
 
 # Weight of rotation errors against position errors, m/rad.
 ROTATION_WEIGHT = 0.2

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from starjax import errors
+from starjax.core import errors
 from starjax.sim import assets
 
 # Sizes that MJX compiles in. Each part adds its own; the scene has the sum.

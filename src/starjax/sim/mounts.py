@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
+from starjax.core.types import Pose
 from starjax.sim import ik, mjcf_parts, robot
 from starjax.sim.arms.base import Arm, Mount
 from starjax.sim.chain import chain_of
 from starjax.sim.tools.base import Tool
 from starjax.sim.workspaces import Workspace
-from starjax.types import Pose
 
 # Angles (rad) of a wrist that targets have in turn: a mount must serve a bent tool as well.
 BENDS = np.deg2rad([(0, 0), (30, 0), (0, 30), (-30, 0), (0, -30)])

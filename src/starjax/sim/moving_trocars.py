@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
+from starjax.core.types import Command
 from starjax.sim import arm_motion, wrist_motion, wrists
 from starjax.sim.scene import BoundArm
 from starjax.sim.state import Env, EnvState
-from starjax.sim.tasks.base import Task
-from starjax.types import Command
+from starjax.sim.task import Task
 
 HELD = 1e-5  # m; a commanded shaft this near to its trocar counts as passing it
 

@@ -13,7 +13,7 @@ from jax.scipy.spatial.transform import Rotation
 from starjax.sim import coupling, solver
 from starjax.sim.quiet_mjx import mjx
 from starjax.sim.scene import BoundArm, Scene
-from starjax.sim.tasks.base import Contacts
+from starjax.sim.task import Contacts
 
 # Beyond it the solver has diverged (rad/s, of an arm's joints).
 MAX_ARM_SPEED = 20.0

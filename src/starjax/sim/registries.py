@@ -9,28 +9,27 @@ dict from (arm, tool, workspace) to `Mount`, for arms of other packages; one of 
 import warnings
 from typing import TYPE_CHECKING
 
-from starjax import extensions
-from starjax.registry import Registry, entries
-from starjax.runtime import sources
+from starjax.core import extensions, sources
+from starjax.core.registry import Registry, entries
 from starjax.sim.arms.base import Arm, Mount
 from starjax.sim.names import SceneNames
 
 if TYPE_CHECKING:  # importing it takes jax
-    from starjax.sim.tasks.base import Task
+    from starjax.sim.task import Task
 
 tasks = Registry(
     "task",
     {
-        "peg_transfer": "starjax.sim.tasks.peg_transfer.task:TASK",
-        "needle_pick": "starjax.sim.tasks.needle_pick.task:TASK",
-        "peg_transfer_bimanual": "starjax.sim.tasks.peg_transfer_bimanual.task:TASK",
-        "reach": "starjax.sim.tasks.reach.task:TASK",
-        "needle_handover": "starjax.sim.tasks.needle_handover.task:TASK",
-        "ring_on_wire": "starjax.sim.tasks.ring_on_wire.task:TASK",
-        "endoscope_track": "starjax.sim.tasks.endoscope_track.task:TASK",
+        "peg_transfer": "starjax.tasks.peg_transfer.task:TASK",
+        "needle_pick": "starjax.tasks.needle_pick.task:TASK",
+        "peg_transfer_bimanual": "starjax.tasks.peg_transfer_bimanual.task:TASK",
+        "reach": "starjax.tasks.reach.task:TASK",
+        "needle_handover": "starjax.tasks.needle_handover.task:TASK",
+        "ring_on_wire": "starjax.tasks.ring_on_wire.task:TASK",
+        "endoscope_track": "starjax.tasks.endoscope_track.task:TASK",
         **extensions.parts("task"),
     },
-    "starjax.sim.tasks.base:Task",
+    "starjax.sim.task:Task",
 )
 arms = Registry(
     "arm",
@@ -66,7 +65,7 @@ workspaces = Registry(
 rescuers = Registry(
     "rescuer",
     extensions.parts("rescuer"),
-    "starjax.sim.tasks.rescue:Rescuer",
+    "starjax.sim.rescuer:Rescuer",
 )
 
 

@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from starjax import errors
+from starjax.core import errors
+from starjax.core.types import Pose
 from starjax.sim.camera import cast, texture, tiles
 from starjax.sim.camera import geometry as scenes
 from starjax.sim.camera import viewpoint as views
-from starjax.types import Pose
 
 geom_rgb = scenes.geom_rgb
 

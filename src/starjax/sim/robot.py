@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import mujoco
 
-from starjax import errors
+from starjax.core import errors
 from starjax.sim import mjcf_parts
 from starjax.sim.arms.base import Arm
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from starjax import rcm
 from starjax.sim import registries
-from starjax.sim.tasks.base import Task
+from starjax.sim.task import Task
 
 
 def sample_trocars(key: jax.Array, task: Task, shape: tuple[int, ...] = ()) -> rcm.Trocar:

@@ -12,8 +12,8 @@ import jax
 import mujoco
 import numpy as np
 
-from starjax import errors
-from starjax.config import DEFAULT_TASK
+from starjax.core import errors
+from starjax.core.config import DEFAULT_TASK
 from starjax.sim import (
     contract,
     derived_views,
@@ -30,7 +30,7 @@ from starjax.sim.camera import geometry
 from starjax.sim.chain import chain_of
 from starjax.sim.names import TISSUE, SceneNames
 from starjax.sim.quiet_mjx import mjx
-from starjax.sim.tasks.base import Task
+from starjax.sim.task import Task
 from starjax.sim.tools.base import Tool
 
 # Velocities from which MuJoCo and MJX choose sparse matrices; the contact solver has dense ones.

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
+from starjax.core.types import Command, Observation, Pose
 from starjax.sim import physics, render
 from starjax.sim.names import SceneNames
 from starjax.sim.scene import Scene
-from starjax.sim.tasks.base import Task
-from starjax.types import Command, Observation, Pose
+from starjax.sim.task import Task
 
 
 class EnvParams(NamedTuple):

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from starjax.types import Pose
+from starjax.core.types import Pose
 
 
 def place(m: mujoco.MjModel, data: mujoco.MjData, still: Pose | None) -> None:

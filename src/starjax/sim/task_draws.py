@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import errors
+from starjax.core import errors
 from starjax.runtime import user_code
 from starjax.sim.scene import Scene
 

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from starjax import errors
+from starjax.core import errors
 from starjax.sim import registries
-from starjax.sim.tasks.base import Task
+from starjax.sim.task import Task
 
 OUTSIDE = 0.01  # m, from the region: the largest error of `trocar_offset` in a stress test
 

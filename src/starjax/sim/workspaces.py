@@ -67,7 +67,7 @@ SIDE_ENDOSCOPE = BOARD_ENDOSCOPE._replace(
 
 
 # Two arms at either side, their rolls' zeros half a turn apart. Each trocar varies by 3 cm along x
-# and 4.3 cm along y; see `sim.tasks.two_arms` for their pairs.
+# and 4.3 cm along y; see `tasks.two_arms` for their pairs.
 LEFT = BOARD._replace(
     radius=(0.054, 0.084),
     polar=(math.radians(87), math.radians(93)),

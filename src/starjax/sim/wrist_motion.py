@@ -11,9 +11,9 @@ import numpy as np
 from jax.scipy.spatial.transform import Rotation
 
 from starjax import rcm
+from starjax.core.types import Pose
 from starjax.sim import control, ik
 from starjax.sim import scene as scenes
-from starjax.types import Pose
 
 # Size of the reference's velocity: tip (3) m/s, turn (3) rad/s, its shaft at the trocar (3) m/s.
 VELOCITY = 9

@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 
-from starjax import rcm, registry
+from starjax import rcm
+from starjax.core import registry
+from starjax.core.types import Agent, Command, Pose
 from starjax.sim import registries
 from starjax.sim.names import SceneNames
-from starjax.sim.tasks.base import Task
-from starjax.types import Agent, Command, Pose
+from starjax.sim.task import Task
 
 if TYPE_CHECKING:  # it imports the physics
-    from starjax.sim.tasks.rescue import Rescuer
+    from starjax.sim.rescuer import Rescuer
 
 Held = tuple[rcm.Wrist | None, ...]  # the wrist of each arm's tool
 

@@ -14,7 +14,7 @@ import functools
 from collections.abc import Iterator
 from typing import Any
 
-from starjax import errors
+from starjax.core import errors
 from starjax.testing import kinds
 from starjax.testing.base import FAILED
 

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
+from starjax.core.types import Pose
 from starjax.rcm.actions import ACTION_SPACES, ActionSpace
 from starjax.runtime import user_code
 from starjax.sim import registries
 from starjax.testing.base import FAILED, Check, attempt, verdict
-from starjax.types import Pose
 
 COUNT = 256  # poses
 TASK = "peg_transfer"  # task of its trocars and tips

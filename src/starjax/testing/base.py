@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from starjax import errors
+from starjax.core import errors
 
 OK, NOTE, FAILED = "ok", "note", "failed"
 

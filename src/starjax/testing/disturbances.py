@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
+from starjax.core.types import Command, Observation
 from starjax.evaluation.disturbances import DISTURBANCES
 from starjax.evaluation.disturbances import base as disturbances
 from starjax.evaluation.disturbances.base import Disturbance
 from starjax.sim import env as envs
-from starjax.sim.tasks.base import CONTROL_HZ
+from starjax.sim.task import CONTROL_HZ
 from starjax.testing.base import NOTE, Check, attempt, verdict
-from starjax.types import Command, Observation
 
 TASK = "reach"
 STEPS = 8  # control steps of an episode that moves down

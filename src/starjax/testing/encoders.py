@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax.learners import ENCODERS
-from starjax.models.encoders import ImageEncoder, Trunk
+from starjax.core.learners import ENCODERS
+from starjax.policies.models.encoders import ImageEncoder, Trunk
 from starjax.runtime import user_code
 from starjax.testing.base import FAILED, NOTE, Check, attempt, failed, verdict
 

@@ -4,11 +4,11 @@ import importlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-from starjax import errors, extensions, methods
-from starjax.commands import presets
-from starjax.learners import ENCODERS, LEARNERS
+from starjax.cli import presets
+from starjax.core import errors, extensions, methods
+from starjax.core.learners import ENCODERS, LEARNERS
+from starjax.core.registry import Registry, load
 from starjax.policies.external import POLICIES
-from starjax.registry import Registry, load
 from starjax.sim import registries
 
 if TYPE_CHECKING:

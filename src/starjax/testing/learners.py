@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from starjax import config
-from starjax.commands import presets
-from starjax.learners import LEARNERS
+from starjax.cli import presets
+from starjax.core import config
+from starjax.core.learners import LEARNERS
 from starjax.policies import learner_contract
 from starjax.policies.sequences import Condition, SequenceModel, Sizes
 from starjax.testing.base import Check, attempt, failed, verdict

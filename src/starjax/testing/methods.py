@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import jax
 
 from starjax import rcm
-from starjax.commands import presets
-from starjax.methods import METHODS, Method
+from starjax.cli import presets
+from starjax.core.methods import METHODS, Method
 from starjax.policies import policy
 from starjax.runtime import user_code
 from starjax.sim import registries, scene, wrists

@@ -3,9 +3,9 @@
 import dataclasses
 from collections.abc import Iterator
 
-from starjax import config, config_json, limits
-from starjax.commands import checks, presets, scenes
-from starjax.methods import TABLE_II
+from starjax.cli import checks, presets, scenes
+from starjax.core import config, config_json, limits
+from starjax.core.methods import TABLE_II
 from starjax.testing.base import NOTE, Check, attempt, verdict
 
 

@@ -8,14 +8,16 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from starjax import config, errors, rcm
+from starjax import rcm
+from starjax.core import config, errors
+from starjax.core.types import Pose
 from starjax.data import stillness
 from starjax.evaluation import expert as episodes
 from starjax.rollouts.success_quota import MIN_SUCCESS_RATE
 from starjax.sim import contract, coupling, physics, registries, sampling, task_draws
 from starjax.sim import env as envs
 from starjax.sim.scene import Scene
-from starjax.sim.tasks.base import CONTROL_HZ, SimReadings, Task
+from starjax.sim.task import CONTROL_HZ, SimReadings, Task
 from starjax.testing import task_starts
 from starjax.testing.base import (
     FAILED,
@@ -28,7 +30,6 @@ from starjax.testing.base import (
     outside,
     verdict,
 )
-from starjax.types import Pose
 
 SEED = 0
 MAX_RCM_ERROR = 1e-3  # m, executed by an expert

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from starjax import errors
+from starjax.core import errors
 from starjax.runtime import processes, xla
 
 AXIS = "batch"

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from starjax import config, errors
-from starjax.models import pretrained
+from starjax.core import config, errors
 from starjax.policies import features, generator, packaged, policy_file
 from starjax.policies.base import Params
+from starjax.policies.models import pretrained
 
 _WEIGHTS = "policy.encoder_weights"
 

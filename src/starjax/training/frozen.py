@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from starjax import config
+from starjax.core import config
 from starjax.data import redraw
 from starjax.policies import features as inputs
 from starjax.policies import generator

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import config, rcm
+from starjax import rcm
+from starjax.core import config
 from starjax.data import windows
 from starjax.policies.base import Policy
 from starjax.runtime.precompile import Program

@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import config, errors, methods
+from starjax.core import config, errors, methods
 from starjax.data import normalizer, windows
 from starjax.policies import features
 from starjax.policies import policy as policies
 from starjax.rcm import arrays
 from starjax.runtime import background, precompile, processes, progress
-from starjax.sim.tasks.base import Task
+from starjax.sim.task import Task
 from starjax.training import checkpoint, devices, holdout, log, metrics, redrawing, stepper
 from starjax.training import state as states
 from starjax.training.sharding import StateLayout, StepCarry

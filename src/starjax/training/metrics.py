@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import jax
 import jax.numpy as jnp
 
-from starjax import config, errors
+from starjax.core import config, errors
 
 Sums = dict[str, jax.Array]
 

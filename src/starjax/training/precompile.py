@@ -6,19 +6,20 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from starjax import config, methods, rcm
+from starjax import rcm
+from starjax.core import config, methods
+from starjax.core.types import Command, Observation, Pose
 from starjax.data import normalizer, windows
 from starjax.policies import features
 from starjax.policies import policy as policies
 from starjax.rcm import arrays
 from starjax.runtime import precompile
 from starjax.sim import wrists
-from starjax.sim.tasks.base import Task
+from starjax.sim.task import Task
 from starjax.training import devices, stepper
 from starjax.training import state as states
 from starjax.training.sharding import StateLayout
 from starjax.training.step import Setup, runs_in_a_loop
-from starjax.types import Command, Observation, Pose
 
 
 @arrays.broadcasting

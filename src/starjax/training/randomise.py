@@ -12,9 +12,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from starjax import config, errors
+from starjax.core import config, errors
+from starjax.core.types import Observation, Pose
 from starjax.evaluation.disturbances import DISTURBANCES, base, parse_levels
-from starjax.types import Observation, Pose
 
 PROBABILITY = 0.5  # probability of each disturbance in a disturbed sample
 ARGUMENT = "train.randomise"

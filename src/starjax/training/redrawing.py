@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from starjax.core.types import Pose
 from starjax.runtime.precompile import Program
 from starjax.sim.state import ImageSource
 from starjax.training import devices, randomise
 from starjax.training import step as steps
-from starjax.types import Pose
 
 # (ImageSource of one moment) -> camera's name -> image; its cameras follow the source's poses.
 Draw = Callable[[ImageSource], Mapping[str, Any]]

@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from starjax.models import kernels
 from starjax.policies.base import Params
+from starjax.policies.models import kernels
 from starjax.training import devices
 from starjax.training.state import TrainState
 

@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from starjax import config, methods
+from starjax.core import config, methods
 from starjax.data import normalizer, stillness, windows
 from starjax.policies import policy as policies
-from starjax.sim.tasks.base import Task
+from starjax.sim.task import Task
 from starjax.training import encoder
 from starjax.training import state as states
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from starjax import config
+from starjax.core import config
 from starjax.data import normalizer
 from starjax.policies.base import Params, Policy
 from starjax.runtime.precompile import Program

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from starjax import config
+from starjax.core import config
 from starjax.data import windows
 from starjax.policies.base import Policy
 from starjax.rcm import arrays

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import errors
+from starjax.core import errors
 from starjax.data import windows
 from starjax.runtime import processes
 from starjax.runtime.precompile import Program

@@ -7,9 +7,9 @@ import pytest
 
 from starjax.addons.finetune.rescuers import midway
 from starjax.addons.finetune.rescuers import peg_transfer as rescue
-from starjax.sim.tasks import scripting
-from starjax.sim.tasks.base import CONTROL_HZ
-from starjax.sim.tasks.peg_transfer import expert
+from starjax.sim.task import CONTROL_HZ
+from starjax.tasks import scripting
+from starjax.tasks.peg_transfer import expert
 
 STEPS = 230  # control steps, up to the last phase of the slowest
 KEYS = jax.random.split(jax.random.key(4), 12)

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax import config, methods
 from starjax.addons.finetune import distill, policy_gradient
+from starjax.core import config, methods
 from starjax.data import windows
 from starjax.policies import policy as policies
 from starjax.policies.learners.onestep import OnestepConfig

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import stubs
 
-from starjax import config
 from starjax.addons.finetune import dagger
 from starjax.addons.finetune.commands import (
     finetune,
@@ -22,16 +21,17 @@ from starjax.addons.finetune.commands import (
     finetune_stages,
     finetune_work,
 )
-from starjax.commands import policy_evaluation
+from starjax.cli import policy_evaluation
+from starjax.core import config
+from starjax.core.registry import Registry
+from starjax.core.types import Command, Pose
 from starjax.data import normalizer, store
-from starjax.monitor import calibrate, scores
 from starjax.policies import in_env, policy_file
 from starjax.policies.base import Policy
 from starjax.policies.learners.onestep import OnestepConfig
-from starjax.registry import Registry
+from starjax.policies.monitor import calibrate, scores
 from starjax.runtime import files
 from starjax.sim import registries
-from starjax.types import Command, Pose
 
 HORIZON = fakes.TINY.horizon
 TRAIN = config.TrainConfig(batch_size=8, learning_rate=0.5, holdout_demos=1, log_every=6)

@@ -9,8 +9,8 @@ from starjax import rcm
 from starjax.addons.finetune.rescuers import needle_handover as rescue
 from starjax.data import stillness
 from starjax.sim import env as envs
-from starjax.sim.tasks.base import CONTROL_HZ
-from starjax.sim.tasks.needle_handover import expert
+from starjax.sim.task import CONTROL_HZ
+from starjax.tasks.needle_handover import expert
 
 STEPS, LANES, EVERY, HORIZON = 400, 6, 5, 8
 GRIP = -0.5  # opening of jaws about a wire

@@ -8,11 +8,11 @@ import jax
 import numpy as np
 import pytest
 
-from starjax import config
 from starjax.addons.finetune import mixing
+from starjax.core import config
+from starjax.core.methods import METHODS
 from starjax.data import normalizer, redraw, windows
 from starjax.data.episode_array import EpisodeArray
-from starjax.methods import METHODS
 
 SETTINGS = config.TrainConfig(holdout_demos=2, window_stride=3)
 ROW = METHODS["stardiff"]

@@ -9,8 +9,8 @@ import pytest
 
 from starjax import rcm
 from starjax.addons.finetune.rescuers import needle_handover as rescue
-from starjax.sim.tasks.needle_handover import expert
-from starjax.types import Pose
+from starjax.core.types import Pose
+from starjax.tasks.needle_handover import expert
 
 START = jnp.array([-0.024, 0.0, 0.001])  # m, of the needle
 OPEN, EMPTY, FULL = 1.0, -0.8, -0.5  # measured openings

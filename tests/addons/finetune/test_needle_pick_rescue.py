@@ -10,9 +10,9 @@ import stubs
 
 from starjax import rcm
 from starjax.addons.finetune.rescuers import needle_pick as rescue
-from starjax.sim.tasks import phases
-from starjax.sim.tasks.needle_pick import expert
-from starjax.types import Pose
+from starjax.core.types import Pose
+from starjax.tasks import phases
+from starjax.tasks.needle_pick import expert
 
 GROUND, HEIGHT = 0.0005, 0.03  # m, of the resting and of the lifted needle
 FRAME = rcm.trocar_frame(rcm.Trocar(*jnp.zeros((3, 1))), jnp.array([[0.0, 0.0, 0.15]]))

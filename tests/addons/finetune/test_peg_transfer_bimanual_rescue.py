@@ -9,10 +9,10 @@ import pytest
 
 from starjax import rcm
 from starjax.addons.finetune.rescuers import peg_transfer_bimanual as rescue
-from starjax.sim.tasks.peg_transfer import task as single
-from starjax.sim.tasks.peg_transfer_bimanual import expert
-from starjax.sim.tasks.peg_transfer_bimanual.task import PARK
-from starjax.types import Pose
+from starjax.core.types import Pose
+from starjax.tasks.peg_transfer import task as single
+from starjax.tasks.peg_transfer_bimanual import expert
+from starjax.tasks.peg_transfer_bimanual.task import PARK
 
 OPEN, EMPTY, FULL = 1.0, -1.0, -0.3  # measured openings
 GIVER, TAKER, BOTH, NONE = (True, False), (False, True), (True, True), (False, False)

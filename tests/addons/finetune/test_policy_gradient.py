@@ -11,14 +11,14 @@ import optax
 import pytest
 import stubs
 
-from starjax import config, methods
 from starjax.addons.finetune import advantages, critic, explore, noise_level, policy_gradient
+from starjax.core import config, methods
+from starjax.core.types import Command, Pose
 from starjax.data import normalizer
 from starjax.policies import policy as policies
 from starjax.policies.base import Policy
 from starjax.policies.learners.onestep import OnestepConfig
 from starjax.sim import wrists
-from starjax.types import Command, Pose
 
 TROCARS = stubs.trocars(0, 8)
 COUNT = 64

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from starjax.addons.finetune.rescuers import peg_transfer as rescue
-from starjax.sim.tasks import phases, scripting
-from starjax.sim.tasks.peg_transfer import expert, task
-from starjax.types import Pose
+from starjax.core.types import Pose
+from starjax.tasks import phases, scripting
+from starjax.tasks.peg_transfer import expert, task
 
 KEYS = jax.random.split(jax.random.key(3), 12)
 

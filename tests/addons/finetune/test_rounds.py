@@ -8,10 +8,10 @@ import pytest
 import stubs
 
 from starjax.addons.finetune import dagger, mixing, rounds, self_imitation
+from starjax.core.types import Command, Pose
 from starjax.data import load, redraw, store
 from starjax.rollouts import agent, attempts, takeover
 from starjax.rollouts.placement import DeviceLayout
-from starjax.types import Command, Pose
 
 TROCARS = stubs.trocars(0, 8)
 LIMITS = takeover.TakeoverLimits(20, 9)

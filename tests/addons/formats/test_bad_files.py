@@ -13,8 +13,8 @@ import pyarrow.parquet as parquet
 import pytest
 import zarr
 
-from starjax import errors
 from starjax.addons.formats import base, lerobot
+from starjax.core import errors
 from starjax.runtime import xla
 
 NAMES = base.writable()

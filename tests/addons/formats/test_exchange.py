@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import recorded
 
-from starjax import config
 from starjax.addons.formats.commands import export_command, import_command
-from starjax.commands import demonstrations, inspect_command, options, presets, run_settings
+from starjax.cli import demonstrations, inspect_command, options, presets, run_settings
+from starjax.core import config
 from starjax.data import store
 
 MAP = """

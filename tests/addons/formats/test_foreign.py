@@ -26,7 +26,7 @@ from strangers import (
     wxyz,
 )
 
-from starjax import errors, rcm
+from starjax import rcm
 from starjax.addons.formats import (
     base,
     exchange,
@@ -38,6 +38,7 @@ from starjax.addons.formats import (
     trocars,
 )
 from starjax.addons.formats.mapping import ArmColumns, CameraColumn, Map, ShaftColumns
+from starjax.core import errors
 from starjax.data import anomalies, load, schema, store
 
 

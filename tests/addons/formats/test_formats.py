@@ -15,8 +15,9 @@ import recorded
 import zarr
 from scipy.spatial import transform
 
-from starjax import errors, rcm
+from starjax import rcm
 from starjax.addons.formats import base, exchange, foreign, own_columns, peer_columns
+from starjax.core import errors
 from starjax.data import load, pose_rows, store
 from starjax.rollouts import episodes
 

@@ -5,7 +5,7 @@ import json
 import mistakes
 import openh
 
-from starjax.commands import inspect_command, inspect_page
+from starjax.cli import inspect_command, inspect_page
 
 
 def test_a_dataset_of_others_has_a_page(tmp_path):

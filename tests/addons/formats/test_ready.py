@@ -9,8 +9,8 @@ import openh
 import pytest
 from msgspec import structs
 
-from starjax import errors
 from starjax.addons.formats import base, foreign, mapping, ready
+from starjax.core import errors
 from starjax.data import load, schema, store
 from starjax.sim import registries
 

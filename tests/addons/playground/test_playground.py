@@ -13,8 +13,8 @@ import pytest
 
 from starjax.addons.playground import environment as playground
 from starjax.addons.playground import registry as playground_registry
+from starjax.core.types import Command
 from starjax.envs import settings
-from starjax.types import Command
 
 LANES, STEPS = 4, 120
 

@@ -8,8 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starjax.addons.robots import crtk, psm
-from starjax.errors import UsageError
-from starjax.types import Pose
+from starjax.core.errors import UsageError
+from starjax.core.types import Pose
 
 AT = crtk.Frames(Pose(np.eye(3), np.zeros(3)), Pose(np.eye(3), np.zeros(3)))
 

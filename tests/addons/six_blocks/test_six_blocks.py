@@ -9,10 +9,10 @@ import pytest
 from starjax import rcm
 from starjax.addons.six_blocks import environment as six_blocks
 from starjax.addons.six_blocks import task as six
+from starjax.core.types import Agent, Command, Pose
 from starjax.sim import env as envs
 from starjax.sim import scene
-from starjax.sim.tasks.peg_transfer_bimanual import task
-from starjax.types import Agent, Command, Pose
+from starjax.tasks.peg_transfer_bimanual import task
 
 WORK = 5  # control steps of an agent's own that a block takes
 ASIDE = jnp.array([0.001, -0.002, 0.0])  # m from its peg, where each block is put

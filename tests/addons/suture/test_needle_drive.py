@@ -14,10 +14,10 @@ from starjax import rcm
 from starjax.addons.suture.needle_drive import expert, grasps, rescue, task
 from starjax.addons.suture.tissue import driving, hole
 from starjax.addons.suture.tissue import needle as needles
+from starjax.core.types import Pose
 from starjax.sim import scene
-from starjax.sim.tasks import wrist_script
-from starjax.sim.tasks.base import Contacts, SimReadings
-from starjax.types import Pose
+from starjax.sim.task import Contacts, SimReadings
+from starjax.tasks import wrist_script
 
 TASKS = {"needle_drive": task.TASK, "needle_drive_sh": task.SMALL}
 

@@ -11,8 +11,8 @@ import pytest
 from starjax import rcm
 from starjax.addons.suture.needle_drive import dial, expert, grasps, rescue
 from starjax.addons.suture.tissue import needle as needles
-from starjax.sim.tasks import wrist_script
-from starjax.types import Pose
+from starjax.core.types import Pose
+from starjax.tasks import wrist_script
 
 COUNT = 200
 P_TROCARS = np.asarray(rcm.trocar_position(rcm.TROCARS, np.float32([0.0, 0.0, 0.15])))

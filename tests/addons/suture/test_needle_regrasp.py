@@ -11,11 +11,11 @@ import stubs
 
 from starjax import rcm
 from starjax.addons.suture.needle_regrasp import expert, rescue, task
+from starjax.core.types import Pose
 from starjax.sim import scene
-from starjax.sim.tasks import wrist_script
-from starjax.sim.tasks.base import Contacts, SimReadings
-from starjax.sim.tasks.needle_pick import task as pick
-from starjax.types import Pose
+from starjax.sim.task import Contacts, SimReadings
+from starjax.tasks import wrist_script
+from starjax.tasks.needle_pick import task as pick
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ import stubs
 from jax.scipy.spatial.transform import Rotation
 
 from starjax.addons.suture import slack
+from starjax.core.types import Command, Pose
 from starjax.sim import ik
-from starjax.types import Command, Pose
 
 TIP = Pose(jnp.diag(jnp.array([1.0, -1.0, -1.0])), jnp.array([0.01, 0.0, 0.02]))
 

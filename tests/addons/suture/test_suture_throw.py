@@ -14,10 +14,10 @@ from starjax.addons.suture.needle_drive import grasps
 from starjax.addons.suture.needle_drive import task as driven
 from starjax.addons.suture.suture_throw import expert, far_grasp, rescue, task
 from starjax.addons.suture.tissue import needle as needles
+from starjax.core.types import Pose
 from starjax.sim import physics, scene
-from starjax.sim.tasks import wrist_script
-from starjax.sim.tasks.base import SimReadings
-from starjax.types import Pose
+from starjax.sim.task import SimReadings
+from starjax.tasks import wrist_script
 
 TASK = task.TASK
 

@@ -9,8 +9,8 @@ from starjax.addons.suture.needle_drive import grasps, task
 from starjax.addons.suture.tissue import driving, hole, prescribed, rows
 from starjax.addons.suture.tissue import needle as needles
 from starjax.addons.suture.tissue.needle import Bite
-from starjax.sim.tasks import scripting
-from starjax.types import Pose
+from starjax.core.types import Pose
+from starjax.tasks import scripting
 
 H = 1.0 / 240
 SIZE = needles.CT1

@@ -6,8 +6,8 @@ import types
 import numpy as np
 import pytest
 
-from starjax import errors
 from starjax.addons.viewer import devices
+from starjax.core import errors
 
 
 def test_a_device_without_its_library_is_a_mistake(monkeypatch):

@@ -11,9 +11,9 @@ from starjax.addons.finetune import mixing
 from starjax.addons.finetune.commands import interventions
 from starjax.addons.finetune.settings import FinetuneConfig
 from starjax.addons.viewer import recorder
+from starjax.core.types import Command, Pose
 from starjax.data import load, store
 from starjax.rollouts import agent, trocars
-from starjax.types import Command, Pose
 
 SEED, EXECUTE, OBS_HORIZON = 4, 4, 2
 TAKEN, TROCAR = 6, 2  # control step of the takeover; index of the configuration

@@ -10,9 +10,10 @@ import urllib.request
 import numpy as np
 import pytest
 
-from starjax import errors, rcm
+from starjax import rcm
 from starjax.addons.viewer import handles, success_map, trocar_controls
 from starjax.addons.viewer import page as pages
+from starjax.core import errors
 from starjax.evaluation import result
 from starjax.runtime import connections
 from starjax.sim import registries

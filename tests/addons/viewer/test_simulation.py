@@ -12,12 +12,12 @@ import stubs
 from starjax import rcm
 from starjax.addons.viewer import episode_alarm, simulation
 from starjax.addons.viewer.frame import outcome
+from starjax.core.types import Command
 from starjax.evaluation import alarms
-from starjax.monitor import calibrate, scores
+from starjax.policies.monitor import calibrate, scores
 from starjax.rollouts import agent, engine, episodes, plans
 from starjax.sim import arm_motion, ik, moving_trocars, registries, wrist_motion
 from starjax.sim import scene as scenes
-from starjax.types import Command
 
 
 def stubbed():

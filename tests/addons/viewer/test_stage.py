@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from starjax.addons.viewer import meshes, stage
+from starjax.core.types import Pose
 from starjax.sim import scene
-from starjax.types import Pose
 
 ROUND = ("mjGEOM_SPHERE", "mjGEOM_CAPSULE", "mjGEOM_CYLINDER", "mjGEOM_BOX", "mjGEOM_ELLIPSOID")
 

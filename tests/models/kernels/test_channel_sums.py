@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax.models import kernels, layers
-from starjax.models.kernels import channel_sums
+from starjax.policies.models import kernels, layers
+from starjax.policies.models.kernels import channel_sums
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax.models import kernels, process, resnet, unet1d
+from starjax.policies.models import kernels, process, resnet, unet1d
 
 
 def normal(*shape):
@@ -62,7 +62,7 @@ WORK = {
 @pytest.mark.parametrize("part", kernels.VARIANTS)
 def test_without_a_variant_the_reference_gives_the_same(part, monkeypatch):
     module = importlib.import_module(
-        f"starjax.models.kernels.{kernels.VARIANTS[part].split(':')[0]}"
+        f"starjax.policies.models.kernels.{kernels.VARIANTS[part].split(':')[0]}"
     )
     monkeypatch.setattr(module, "pays", lambda *size: True)
     jax.clear_caches()

@@ -4,9 +4,9 @@ import chex
 import jax
 import numpy as np
 
-from starjax.config import TrainConfig
-from starjax.models import encoders, kernels
-from starjax.models.kernels import packed_params
+from starjax.core.config import TrainConfig
+from starjax.policies.models import encoders, kernels
+from starjax.policies.models.kernels import packed_params
 from starjax.training.state import make_optimizer
 
 

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax.models import resnet
-from starjax.models.group_norm import GroupNorm
-from starjax.models.kernels import pooled_norm
+from starjax.policies.models import resnet
+from starjax.policies.models.group_norm import GroupNorm
+from starjax.policies.models.kernels import pooled_norm
 
 KEY = jax.random.key(0)
 

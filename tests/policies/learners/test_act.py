@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import repeats
 
-from starjax import config, errors
-from starjax.models import transformer
+from starjax.core import config, errors
 from starjax.policies import sequences
 from starjax.policies.learners import act
+from starjax.policies.models import transformer
 
 SMALL = config.with_options(
     config.with_learner(fakes.TINY, "act"),

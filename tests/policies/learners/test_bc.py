@@ -8,8 +8,8 @@ import optax
 import pytest
 import repeats
 
-from starjax import config
-from starjax.models import regression
+from starjax.core import config
+from starjax.policies.models import regression
 
 SPREAD = 0.1
 

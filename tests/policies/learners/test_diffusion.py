@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import repeats
 
-from starjax import config, errors
-from starjax.models import diffusion, schedule
-from starjax.models.kernels import parallel_ddim
+from starjax.core import config, errors
 from starjax.policies.learners import diffusion as learner
+from starjax.policies.models import diffusion, schedule
+from starjax.policies.models.kernels import parallel_ddim
 
 
 def tiny(**changed):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import repeats
 
-from starjax import config
-from starjax.models import flow
+from starjax.core import config
+from starjax.policies.models import flow
 
 MEAN, SPREAD = 0.3, 0.2  # of a normal distribution
 FAR = 1e9 * np.array([-1.0, 1.0])

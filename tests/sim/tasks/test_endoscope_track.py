@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from starjax import rcm
+from starjax.core.types import Pose
 from starjax.sim import ik, registries, scene
 from starjax.sim.chain import chain_of
-from starjax.sim.tasks.base import Contacts, SimReadings
-from starjax.sim.tasks.endoscope_track import expert, task
-from starjax.types import Pose
+from starjax.sim.task import Contacts, SimReadings
+from starjax.tasks.endoscope_track import expert, task
 
 NO_CONTACTS = Contacts(jnp.zeros((0, 2), jnp.int32), jnp.zeros(0))
 TARGET = jnp.array([0.02, -0.015, 0.03])

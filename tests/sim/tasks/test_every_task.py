@@ -13,7 +13,7 @@ from starjax import rcm
 from starjax.data import stillness
 from starjax.sim import assets, mjcf_parts, registries, scene
 from starjax.sim import env as envs
-from starjax.sim.tasks.needle_pick import task as needle
+from starjax.tasks.needle_pick import task as needle
 
 LANES = 4
 # Peg transfer's own tests run its expert through every trocar.

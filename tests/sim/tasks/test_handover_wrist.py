@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from starjax import rcm
-from starjax.sim.tasks import scripting, two_arms
-from starjax.sim.tasks.needle_handover import expert_wrist, task
-from starjax.sim.tasks.wrist_script import WRIST
-from starjax.types import Pose
+from starjax.core.types import Pose
+from starjax.tasks import scripting, two_arms
+from starjax.tasks.needle_handover import expert_wrist, task
+from starjax.tasks.wrist_script import WRIST
 
 REFS = np.array([slot.p_world_ref for slot in two_arms.SLOTS], np.float32)
 ZEROS = np.array([slot.roll_zero for slot in two_arms.SLOTS], np.float32)

@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+from starjax.core.types import Pose
 from starjax.sim import scene
-from starjax.sim.tasks.base import Contacts, SimReadings
-from starjax.sim.tasks.needle_handover import task
-from starjax.sim.tasks.needle_pick import task as single
-from starjax.types import Pose
+from starjax.sim.task import Contacts, SimReadings
+from starjax.tasks.needle_handover import task
+from starjax.tasks.needle_pick import task as single
 
 NO_CONTACTS = Contacts(jnp.zeros((0, 2), jnp.int32), jnp.zeros(0))
 GIVER, BOTH, TAKER, NOBODY = (True, False), (True, True), (False, True), (False, False)

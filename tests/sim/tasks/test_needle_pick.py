@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from starjax import rcm
-from starjax.sim.tasks.needle_pick import expert, task
-from starjax.types import Pose
+from starjax.core.types import Pose
+from starjax.tasks.needle_pick import expert, task
 
 BOUND = task.NeedleBound(needle=0, dof=0, height=0.0, point=np.array([]), pads=np.array([]))
 
@@ -30,7 +30,8 @@ def test_wide_jaws_take_no_segment_beside_the_point(angles, last):
             needle=Pose(rcm.rotation_z(yaw), jnp.zeros(3)), touch=jnp.zeros((), bool)
         )
         tip = Pose(jnp.eye(3)[None], jnp.array([[0.0, 0.0, 0.05]]))
-        state = types.SimpleNamespace(pose=tip, measurements=measured, wrist=angles)
+        layout = types.SimpleNamespace(needle=measured.needle)
+        state = types.SimpleNamespace(pose=tip, layout=layout, measurements=measured, wrist=angles)
         return expert.init(key, state).segment
 
     keys, yaws = jax.random.split(jax.random.key(0), 300), jnp.linspace(-3.0, 3.0, 300)

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from starjax.core.types import Pose
 from starjax.sim import scene
-from starjax.sim.tasks import outlines
-from starjax.sim.tasks.base import Contacts, SimReadings
-from starjax.sim.tasks.ring_on_wire import task
-from starjax.types import Pose
+from starjax.sim.task import Contacts, SimReadings
+from starjax.tasks import outlines
+from starjax.tasks.ring_on_wire import task
 
 
 @pytest.fixture(scope="module")

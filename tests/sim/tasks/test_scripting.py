@@ -6,13 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax import registry
+from starjax.core import registry
 from starjax.sim import registries
-from starjax.sim.tasks import scripting
-from starjax.sim.tasks.base import CONTROL_HZ
-from starjax.sim.tasks.needle_handover import expert as handover
-from starjax.sim.tasks.peg_transfer import expert as peg
-from starjax.sim.tasks.peg_transfer_bimanual import expert as bimanual
+from starjax.sim.task import CONTROL_HZ
+from starjax.tasks import scripting
+from starjax.tasks.needle_handover import expert as handover
+from starjax.tasks.peg_transfer import expert as peg
+from starjax.tasks.peg_transfer_bimanual import expert as bimanual
 
 SLOPE = scripting.SLOPE
 

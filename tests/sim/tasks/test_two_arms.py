@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from starjax import rcm
+from starjax.core.types import Pose
 from starjax.envs import trocar_draws
 from starjax.evaluation import sweep
 from starjax.sim import registries, scene
-from starjax.sim.tasks import handover as handovers
-from starjax.sim.tasks import two_arms
-from starjax.sim.tasks.needle_handover import expert as handover
-from starjax.sim.tasks.peg_transfer_bimanual import expert as bimanual
-from starjax.types import Pose
+from starjax.tasks import handover as handovers
+from starjax.tasks import two_arms
+from starjax.tasks.needle_handover import expert as handover
+from starjax.tasks.peg_transfer_bimanual import expert as bimanual
 
 DRAWN = 10_000
 COLLISION = 0.0005  # m, overlap that is called one
@@ -96,7 +96,7 @@ def test_a_tool_first_turns_on_a_way_that_says_how(expert):
         there = Pose(rcm.rotation_z(yaw), jnp.array([0.003, 0.002, 0.01]))
         state = types.SimpleNamespace(
             measurements=types.SimpleNamespace(needle=there, block=there),
-            layout=types.SimpleNamespace(target_peg=jnp.zeros(2)),
+            layout=types.SimpleNamespace(target_peg=jnp.zeros(2), needle=there),
             pose=Pose(jnp.stack([jnp.eye(3)] * 2), tips),
         )
         return expert.PLAY.goals(script, state)

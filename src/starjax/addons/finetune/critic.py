@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from starjax.models import layers
+from starjax.policies.models import layers
 
 WIDTH, LAYERS = 256, 3
 RATE = 5e-4  # learning rate

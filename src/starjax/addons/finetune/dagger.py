@@ -12,13 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from starjax import config, errors
 from starjax.addons.finetune.rounds import LearnedEpisode, Way
+from starjax.core import config, errors, sources
 from starjax.rollouts import episodes, progress, takeover
 from starjax.rollouts.agent import BatchAgent
-from starjax.runtime import sources
 from starjax.sim import registries, wrists
-from starjax.sim.tasks.base import Task
+from starjax.sim.task import Task
 
 NAME = "dagger"
 CLOCK_QUANTILE = 0.95  # quantile of the control steps of the policy's successes

@@ -17,14 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from starjax import config
 from starjax.addons.finetune.explore import Experience
+from starjax.core import config
+from starjax.core.types import Observation
 from starjax.data import windows
 from starjax.policies.base import Params, Policy
 from starjax.policies.learners.flow import FlowConfig
 from starjax.policies.learners.unet import UnetConfig
 from starjax.training import state as training
-from starjax.types import Observation
 
 
 class Student(NamedTuple):

@@ -15,12 +15,12 @@ import jax.numpy as jnp
 
 from starjax import rcm
 from starjax.addons.finetune import critic
+from starjax.core.types import Observation
 from starjax.policies.base import Policy
 from starjax.rcm.trocar import Trocar
 from starjax.runtime import precompile
 from starjax.sim import env as sim_env
 from starjax.sim import wrists
-from starjax.types import Observation
 
 See = Callable[[Any, jax.Array], jax.Array]
 

@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import config, methods, rcm
+from starjax import rcm
+from starjax.core import config, methods
 from starjax.data import load, normalizer, placed_images, redraw, windows
 from starjax.policies import policy as policies
 from starjax.rollouts import takeover

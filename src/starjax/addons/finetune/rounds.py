@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from starjax.core import sources
 from starjax.data import schema, store
 from starjax.evaluation.evaluate import lanes_per_device
 from starjax.rcm.trocar import Trocar
@@ -21,7 +22,6 @@ from starjax.rollouts import chunks, engine, episodes, sharing, takeover
 from starjax.rollouts import trocars as configurations
 from starjax.rollouts.agent import BatchAgent
 from starjax.rollouts.placement import DEFAULT_LAYOUT, DeviceLayout
-from starjax.runtime import sources
 from starjax.sim import env as sim_env
 
 Job = tuple[episodes.Trial, int]  # a trial and the number of its run, see `Way`

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from starjax import config, errors
 from starjax.addons.finetune.rounds import LearnedEpisode, Way
+from starjax.core import config, errors
 from starjax.rollouts import attempts, episodes, progress, takeover
 from starjax.rollouts.agent import BatchAgent
 

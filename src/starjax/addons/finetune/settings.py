@@ -3,8 +3,8 @@
 import dataclasses
 from typing import Annotated, Literal
 
-from starjax import config as config_lib
-from starjax.limits import Count, NotNegative, Range
+from starjax.core import config as config_lib
+from starjax.core.limits import Count, NotNegative, Range
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

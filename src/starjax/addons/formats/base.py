@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from starjax import errors
-from starjax.registry import Registry
+from starjax.core import errors
+from starjax.core.registry import Registry
 from starjax.runtime import files, xla
 
 FORMATS = Registry(

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from starjax import errors
 from starjax.addons.formats import base, peer_columns
 from starjax.addons.formats.base import Column, Source
+from starjax.core import errors
 from starjax.data import redraw, store
 from starjax.rollouts import episodes
 from starjax.runtime import files, provenance, user_code

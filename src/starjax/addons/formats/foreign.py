@@ -12,13 +12,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image
 
-from starjax import errors, rcm
+from starjax import rcm
 from starjax.addons.formats import mapping as maps
 from starjax.addons.formats import motion, selection, stopped, survey
 from starjax.addons.formats.base import Source
 from starjax.addons.formats.mapping import CameraColumn, Map
 from starjax.addons.formats.motion import HZ
 from starjax.addons.formats.survey import Kept
+from starjax.core import errors
 from starjax.data import schema, store
 from starjax.rollouts import episodes
 from starjax.runtime import files, xla

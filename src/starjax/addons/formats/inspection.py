@@ -6,11 +6,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from starjax import errors
 from starjax.addons.formats import base, mapping, own_columns, ready, timing
-from starjax.commands import list_command
-from starjax.commands.inspect_command import Found, spread
-from starjax.commands.list_command import Row
+from starjax.cli import list_command
+from starjax.cli.inspect_command import Found, spread
+from starjax.cli.list_command import Row
+from starjax.core import errors
 from starjax.runtime import progress
 
 _LOOKED_AT = 50  # episodes of a foreign dataset whose values are read

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from msgspec import structs
 
-from starjax import errors
 from starjax.addons.formats import mapping as maps
 from starjax.addons.formats import tip_poses
 from starjax.addons.formats.base import Source
 from starjax.addons.formats.mapping import ArmColumns, Columns, Map
+from starjax.core import errors
 
 _NAMED = re.compile(r"(.+)\[([^\[\]]+)\]")
 _AXIS = re.compile(r"(?:^|[^a-z]|q|quat|rot|pos)([wxyz])(?:[^a-z]|mm|cm|m)*$")

@@ -8,9 +8,9 @@ import numpy as np
 import pyarrow as pa
 from PIL import Image
 
-from starjax import errors
 from starjax.addons.formats import video
 from starjax.addons.formats.base import Column, Source
+from starjax.core import errors
 
 CHUNK = 1000  # files a folder, as LeRobot has them
 _COUNTED = {

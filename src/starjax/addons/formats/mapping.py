@@ -13,8 +13,8 @@ import msgspec
 import numpy as np
 from msgspec import structs
 
-from starjax import errors
 from starjax.addons.formats.base import Source
+from starjax.core import errors
 
 Columns = str | tuple[str, ...]
 Turned = Literal["quat_xyzw", "quat_wxyz", "matrix", "rot6d", "rotvec", "euler_xyz"]

@@ -8,12 +8,12 @@ import numpy as np
 from msgspec import structs
 from scipy.spatial import transform
 
-from starjax import errors
 from starjax.addons.formats import clocks, timing, tip_poses
 from starjax.addons.formats import mapping as maps
 from starjax.addons.formats.base import Source
 from starjax.addons.formats.mapping import ArmColumns, Map
 from starjax.addons.formats.tip_poses import TipPoses
+from starjax.core import errors
 
 HZ = 30.0  # for every dataset
 FAST = 1.0  # m/s, faster tips are jumps

@@ -9,10 +9,10 @@ import re
 import msgspec
 import numpy as np
 
-from starjax import errors
 from starjax.addons.formats import base
 from starjax.addons.formats.base import Source
 from starjax.addons.formats.mapping import ArmColumns, CameraColumn, Map, ShaftColumns
+from starjax.core import errors
 from starjax.rollouts import episodes
 from starjax.sim import registries
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from starjax import errors
 from starjax.addons.formats import base, exchange
 from starjax.addons.formats.base import FORMATS, Column, Format, Source
+from starjax.core import errors
 from starjax.testing.base import Check, attempt, failed, verdict
 
 LENGTHS = (5, 3)  # control steps of the episodes

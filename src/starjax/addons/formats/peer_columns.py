@@ -4,9 +4,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from starjax import errors, rcm
+from starjax import rcm
 from starjax.addons.formats import base
 from starjax.addons.formats.base import Column
+from starjax.core import errors
 from starjax.data import pose_rows, schema, store
 from starjax.rollouts import episodes
 

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from starjax import errors
 from starjax.addons.formats import mapping as maps
 from starjax.addons.formats.base import Column, Source
+from starjax.core import errors
 
 FOLDER = Path(__file__).parent / "maps"
 _SUFFIXES = (".toml", ".json")

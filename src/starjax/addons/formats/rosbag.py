@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from starjax import extras
 from starjax.addons.formats import base, per_file, ros_messages, timing
 from starjax.addons.formats.base import Column, Source, StepTimes
+from starjax.core import extras
 
 _SUFFIXES = (".mcap", ".db3", ".bag")
 _META = "metadata.yaml"  # for a folder that is a rosbag2

@@ -1,8 +1,8 @@
 """Episodes of a dataset that are imported, with their splits and texts."""
 
-from starjax import errors
 from starjax.addons.formats.base import Source
 from starjax.addons.formats.mapping import Map
+from starjax.core import errors
 
 FAILURES = ("failure", "fail")  # splits of episodes that no policy is to learn from
 _WHOLE = {"train"}  # the splits of a dataset that is not split

@@ -9,7 +9,6 @@ import numpy as np
 from msgspec import structs
 from scipy.spatial import transform
 
-from starjax import errors
 from starjax.addons.formats import (
     clocks,
     doubts,
@@ -24,6 +23,7 @@ from starjax.addons.formats import (
 from starjax.addons.formats import mapping as maps
 from starjax.addons.formats.base import Source
 from starjax.addons.formats.mapping import Map
+from starjax.core import errors
 from starjax.data import shafts
 
 _DOWN = (0.0, 0.0, -1.0)

@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from starjax import errors
 from starjax.addons.formats import clocks
 from starjax.addons.formats.base import Source, StepTimes
+from starjax.core import errors
 
 APART = 0.1  # s, by which clocks of one episode may differ
 MAX_GAP_S = 0.5  # s without a value, unless a mapping says more

@@ -9,9 +9,10 @@ import msgspec
 import numpy as np
 from scipy.spatial import transform
 
-from starjax import errors, rcm
+from starjax import rcm
 from starjax.addons.formats import mapping as maps
 from starjax.addons.formats.mapping import ArmColumns, Columns, Map, Quaternion, Vector
+from starjax.core import errors
 from starjax.data import shafts
 
 INSTRUMENTS = {"large_needle_driver": rcm.LARGE_NEEDLE_DRIVER, "prograsp": rcm.PROGRASP}

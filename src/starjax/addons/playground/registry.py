@@ -10,12 +10,12 @@ import dataclasses
 import importlib
 from typing import Any
 
-from starjax import errors
 from starjax.addons.playground import environment as playground
+from starjax.core import errors
 from starjax.envs import registration
 from starjax.envs.settings import EnvSettings
 from starjax.sim import registries
-from starjax.sim.tasks.base import CONTROL_HZ
+from starjax.sim.task import CONTROL_HZ
 
 _OWN = ("task", "episode_length", "ctrl_dt")  # entries that are not settings
 

@@ -11,10 +11,10 @@ import numpy as np
 from starjax.addons.robots import crtk, messages, psm
 from starjax.addons.robots.bus import Bus
 from starjax.addons.robots.robot_file import VIEW, RobotFile
+from starjax.core.errors import UsageError
+from starjax.core.types import Command, Pose
 from starjax.deploy import guard, images
 from starjax.deploy.inputs import RobotObservation
-from starjax.errors import UsageError
-from starjax.types import Command, Pose
 
 WORLD = "world"  # frame of the policy's world in headers
 _IDENTITY = crtk.pose_of_arrays(np.eye(3), np.zeros(3))

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
+from starjax.core.types import Command, Pose
 from starjax.deploy import plan_motion
-from starjax.types import Command, Pose
 
 _STILL = 1e-9  # m and rad; of less no fraction is taken
 

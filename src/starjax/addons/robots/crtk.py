@@ -23,8 +23,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starjax import rcm
-from starjax.errors import UsageError
-from starjax.types import Pose
+from starjax.core.errors import UsageError
+from starjax.core.types import Pose
 
 _MAX_NORM_ERROR = 1e-3  # deviation of a quaternion's length from one
 

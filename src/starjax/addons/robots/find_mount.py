@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from starjax import config as config_lib
-from starjax import errors
-from starjax.commands import options
+from starjax.cli import options
+from starjax.core import config as config_lib
+from starjax.core import errors
 from starjax.runtime import jax_start, xla
 
 if TYPE_CHECKING:

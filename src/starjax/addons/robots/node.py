@@ -13,10 +13,10 @@ from starjax import rcm
 from starjax.addons.robots import between, messages
 from starjax.addons.robots.arm import WORLD, CrtkArm
 from starjax.addons.robots.robot_file import RobotFile
+from starjax.core.types import Command
 from starjax.deploy import guard
 from starjax.deploy.client import Client
 from starjax.deploy.plan_executor import Report
-from starjax.types import Command
 
 AT = "/starjax"
 

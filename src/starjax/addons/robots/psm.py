@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from starjax import rcm
 from starjax.addons.robots.crtk import compose
-from starjax.errors import UsageError
-from starjax.types import Pose
+from starjax.core.errors import UsageError
+from starjax.core.types import Pose
 
 JOINTS = (
     "outer_yaw",

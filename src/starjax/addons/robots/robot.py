@@ -8,8 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from starjax.commands import checks, options
-from starjax.limits import Positive
+from starjax.cli import checks, options
+from starjax.core.limits import Positive
 from starjax.runtime import jax_start, signals, xla
 
 DESCRIPTION = """Drives a surgical robot on CRTK's topics over DDS, as ROS 2 has them, by a policy.

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from starjax.addons.robots import crtk, psm
 from starjax.addons.robots.crtk import Jaw
-from starjax.errors import UsageError
-from starjax.types import Pose
+from starjax.core.errors import UsageError
+from starjax.core.types import Pose
 
 INSTRUMENTS = {"large_needle_driver": psm.LARGE_NEEDLE_DRIVER, "prograsp": psm.PROGRASP}
 VIEW = "view"  # the frame of commands relative to the endoscope

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from starjax.addons.robots import crtk, messages, psm
 from starjax.addons.robots.bus import Bus
-from starjax.types import Pose
+from starjax.core.types import Pose
 
 RATE = 200.0  # Hz
 WATCHDOG_S = 0.1

@@ -4,8 +4,8 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Annotated
 
-from starjax.commands import checks, options
-from starjax.limits import Positive, Range
+from starjax.cli import checks, options
+from starjax.core.limits import Positive, Range
 from starjax.runtime import signals
 
 DESCRIPTION = """Serves a patient side manipulator on CRTK's topics over DDS, as ROS 2 has them.
@@ -38,8 +38,8 @@ def main(argv: Sequence[str]) -> int:
     args = options.parse("sim-robot", SimRobotArgs, argv, DESCRIPTION)
     import numpy as np
 
-    from starjax import errors
     from starjax.addons.robots import bus, robot_file, sim_arm
+    from starjax.core import errors
     from starjax.sim import registries
 
     errors.choice("--arm", args.arm, ARMS)

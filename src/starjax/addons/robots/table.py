@@ -1,6 +1,6 @@
 """Commands and parts of the add-on. Imports neither jax nor the add-on."""
 
-from starjax.extensions import AddOn, Subcommand
+from starjax.core.extensions import AddOn, Subcommand
 
 _HERE = "starjax.addons.robots"
 TABLE = AddOn(

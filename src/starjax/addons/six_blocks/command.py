@@ -5,10 +5,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from starjax import config as config_lib
-from starjax import errors
-from starjax.commands import checks, messages, options, policy_args, session
-from starjax.limits import Count
+from starjax.cli import checks, messages, options, policy_args, session
+from starjax.core import config as config_lib
+from starjax.core import errors
+from starjax.core.limits import Count
 
 TASK = "peg_transfer_bimanual"
 
@@ -101,7 +101,7 @@ def _score_policy(
     """Returns the trials of a policy, their environment, and the policy's method and weights."""
     from starjax.addons.six_blocks import environment as six_blocks
     from starjax.addons.six_blocks import task as six
-    from starjax.commands import policy_evaluation
+    from starjax.cli import policy_evaluation
     from starjax.sim import env as sim_env
 
     who, _ = policy_args.load(path)

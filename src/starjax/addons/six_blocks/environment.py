@@ -13,13 +13,13 @@ import jax.numpy as jnp
 
 from starjax import rcm
 from starjax.addons.six_blocks import task as six
+from starjax.core.types import Agent, Command, Pose
 from starjax.sim import env as envs
 from starjax.sim import physics
 from starjax.sim.scene import Scene
 from starjax.sim.state import Env, EnvState
-from starjax.sim.tasks.base import SimReadings
-from starjax.sim.tasks.peg_transfer_bimanual import task
-from starjax.types import Agent, Command, Pose
+from starjax.sim.task import SimReadings
+from starjax.tasks.peg_transfer_bimanual import task
 
 # Control steps of the script: the tips rise, then go to their start.
 RISE, WITHDRAWN = 18, 45

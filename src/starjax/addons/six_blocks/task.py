@@ -8,10 +8,10 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from starjax.sim.tasks.base import Capsules
-from starjax.sim.tasks.peg_transfer import task as single
-from starjax.sim.tasks.peg_transfer_bimanual import task
-from starjax.types import Pose
+from starjax.core.types import Pose
+from starjax.sim.task import Capsules
+from starjax.tasks.peg_transfer import task as single
+from starjax.tasks.peg_transfer_bimanual import task
 
 BLOCKS = 6
 LIMIT_S = 300.0  # for FLS

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.spatial.transform import Rotation
 
+from starjax.core.types import Command, Pose
 from starjax.sim import ik
 from starjax.sim.state import EnvState
-from starjax.types import Command, Pose
 
 TRACKED = math.radians(0.7)  # rad; servos without slack stay this near to their commands
 GAIN = 0.3  # fraction of a change that a lead takes up per control step

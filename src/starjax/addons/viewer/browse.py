@@ -9,17 +9,18 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from starjax import errors, rcm
+from starjax import rcm
 from starjax.addons.viewer import frame as frames
 from starjax.addons.viewer import page
 from starjax.addons.viewer.frame import Frame
 from starjax.addons.viewer.plots import Plots
 from starjax.addons.viewer.stage import Stage, aim
+from starjax.core import errors
+from starjax.core.types import Pose
 from starjax.data import redraw, schema, store
 from starjax.rollouts import episodes, trial_key
 from starjax.sim import registries, scene
 from starjax.sim.names import SceneNames
-from starjax.types import Pose
 
 
 class RecordedDataset(NamedTuple):

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from starjax import errors
+from starjax.core import errors
 
 _DEAD_ZONE = 0.08  # part of a stick's range, about its centre
 

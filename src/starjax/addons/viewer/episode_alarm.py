@@ -4,8 +4,8 @@ import numpy as np
 
 from starjax.addons.viewer.frame import Frame
 from starjax.addons.viewer.simulation import LiveState
-from starjax.monitor.calibrate import Monitor
-from starjax.monitor.watch import Watch
+from starjax.policies.monitor.calibrate import Monitor
+from starjax.policies.monitor.watch import Watch
 
 
 class EpisodeAlarm:

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from starjax.core.types import Pose
 from starjax.sim import registries, scene
 from starjax.sim.camera import geometry
 from starjax.sim.names import SceneNames
-from starjax.types import Pose
 
 
 class Frame(NamedTuple):

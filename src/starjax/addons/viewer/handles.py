@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from starjax.sim import registries, trocar_region
-from starjax.sim.tasks.base import Slot, Task
+from starjax.sim.task import Slot, Task
 
 _SCALE = 0.055  # m, length of the arrows
 RELEASE_S = 0.4  # time without a move after which a handle counts as released

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import scipy.ndimage
 
-from starjax import errors
 from starjax.addons.viewer import front
+from starjax.core import errors
 
 HOST = "127.0.0.1"
 PORT = 8080

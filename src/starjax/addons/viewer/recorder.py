@@ -15,8 +15,9 @@ import numpy as np
 from starjax import rcm
 from starjax.addons.viewer import simulation, tip_handle
 from starjax.addons.viewer.frame import Frame
+from starjax.core.types import Command
 from starjax.data import schema, store
-from starjax.monitor.calibrate import Monitor
+from starjax.policies.monitor.calibrate import Monitor
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import episodes, programs, takeover, trial_key
 from starjax.rollouts import trocars as configurations
@@ -24,7 +25,6 @@ from starjax.runtime import files
 from starjax.runtime.precompile import Program
 from starjax.sim import env as sim_env
 from starjax.sim import wrists
-from starjax.types import Command
 
 OPERATOR = "operator"  # in dataset.json, in place of a scripted expert's name
 

@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax import methods
 from starjax.addons.viewer.frame import Frame
-from starjax.monitor.calibrate import Monitor
+from starjax.core import methods
 from starjax.policies import in_env, packaged
+from starjax.policies.monitor.calibrate import Monitor
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import agent as agents
 from starjax.rollouts import trial_key

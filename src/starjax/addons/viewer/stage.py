@@ -9,9 +9,9 @@ import numpy as np
 
 from starjax.addons.viewer import meshes
 from starjax.addons.viewer.frame import Frame
+from starjax.core.types import Pose
 from starjax.sim import still_bodies, thread_geoms
 from starjax.sim.camera import geometry
-from starjax.types import Pose
 
 _SPACING = 0.6  # m between two rollouts
 _PATH_STEPS = 90  # control steps that the tip's path stays

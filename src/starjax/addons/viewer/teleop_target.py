@@ -16,7 +16,7 @@ from starjax.addons.viewer import page
 from starjax.addons.viewer.devices import Device, DeviceLost, Reading
 from starjax.addons.viewer.tip_handle import TipHandle
 from starjax.sim import registries
-from starjax.sim.tasks.base import Slot
+from starjax.sim.task import Slot
 
 SPEED = 0.05  # m/s at full deflection of a device
 SPIN = 1.5  # rad/s at full deflection

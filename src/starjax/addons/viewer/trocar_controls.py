@@ -14,7 +14,7 @@ from starjax.addons.viewer import page
 from starjax.addons.viewer.handles import TrocarHandles
 from starjax.rcm.trocar import Trocar
 from starjax.sim import registries, sampling
-from starjax.sim.tasks.base import Slot, Task
+from starjax.sim.task import Slot, Task
 
 _MM, _DEG = 1e3, 180.0 / np.pi
 _UNITS = np.array([_MM, _DEG, _DEG])

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from starjax import errors
 from starjax.addons.viewer import page, simulation, success_map
 from starjax.addons.viewer.episode_alarm import EpisodeAlarm
 from starjax.addons.viewer.frame import outcome, rcm_error_mm
@@ -15,6 +14,7 @@ from starjax.addons.viewer.simulation import AgentSpec, Simulation
 from starjax.addons.viewer.stage import Stage, aim
 from starjax.addons.viewer.success_map import SuccessMap
 from starjax.addons.viewer.trocar_controls import TrocarControls
+from starjax.core import errors
 from starjax.sim import registries
 
 OWN_ARMS = "their own"

@@ -7,8 +7,8 @@ Other packages add theirs by an entry point of the group `starjax.disturbances` 
 import math
 from collections.abc import Sequence
 
-from starjax import errors
-from starjax.registry import Registry
+from starjax.core import errors
+from starjax.core.registry import Registry
 
 _HERE = "starjax.evaluation.disturbances"
 

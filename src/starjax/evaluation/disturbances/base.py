@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from starjax import errors
+from starjax.core import errors
+from starjax.core.types import Command, Observation, Pose
 from starjax.evaluation.disturbances import DISTURBANCES
 from starjax.sim import registries
 from starjax.sim.names import is_depth
 from starjax.sim.state import Env, EnvParams, EnvState
-from starjax.types import Command, Observation, Pose
 
 
 class DisturbanceState(NamedTuple):

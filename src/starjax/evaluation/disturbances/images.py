@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.spatial.transform import Rotation
 
+from starjax.core.types import Pose
 from starjax.evaluation.disturbances.base import Disturbance, DisturbanceState
 from starjax.evaluation.disturbances.draws import directions
-from starjax.types import Pose
 
 TURN_PER_MM = 0.5  # deg that a camera is turned per mm that it is moved
 MAX_BLUR = 4  # px to either side; fixes the shapes of the programs

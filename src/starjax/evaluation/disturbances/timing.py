@@ -5,9 +5,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from starjax.core.types import Command, Observation
 from starjax.evaluation.disturbances.base import Disturbance, DisturbanceState
 from starjax.sim.state import Env, EnvState
-from starjax.types import Command, Observation
 
 MAX_DELAY = 4  # control steps in memory
 MAX_LOST = 63  # successive lost observations in training; in episodes there may be more

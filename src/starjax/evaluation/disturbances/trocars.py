@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 
 from starjax import rcm
+from starjax.core.types import Command
 from starjax.evaluation.disturbances.base import Disturbance, DisturbanceState
 from starjax.evaluation.disturbances.draws import directions
 from starjax.sim import moving_trocars
 from starjax.sim.state import Env, EnvParams, EnvState
-from starjax.types import Command
 
 BREATH_HZ = 0.25  # rate of a patient at rest
 LATENCY_S = 0.1  # s, age of a tracked trocar's measurement

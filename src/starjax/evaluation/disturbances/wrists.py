@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 
 from starjax import rcm
+from starjax.core.types import Command, Pose
 from starjax.evaluation.disturbances.base import Disturbance, DisturbanceState
 from starjax.sim.state import Env, EnvState
-from starjax.types import Command, Pose
 
 
 def _with_slack(

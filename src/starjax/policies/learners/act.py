@@ -6,9 +6,9 @@ Sources, and what differs from them: `models.transformer`.
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
-from starjax import config, errors
-from starjax.learners import Learner
-from starjax.limits import Count, NotNegative
+from starjax.core import config, errors
+from starjax.core.learners import Learner
+from starjax.core.limits import Count, NotNegative
 
 if TYPE_CHECKING:  # it imports jax, which `--help` does without
     from starjax.policies.sequences import SequenceModel, Sizes
@@ -40,8 +40,8 @@ def make(options: ActConfig, policy_config: config.PolicyConfig, sizes: "Sizes")
     import jax
     import jax.numpy as jnp
 
-    from starjax.models import diffusion, kernels, transformer
     from starjax.policies import sequences
+    from starjax.policies.models import diffusion, kernels, transformer
     from starjax.policies.sequences import Condition, Params
 
     dtype = jnp.dtype(policy_config.dtype)

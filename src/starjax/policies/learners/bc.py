@@ -6,9 +6,9 @@ Not in the paper. Sources: `models.regression`.
 import dataclasses
 from typing import TYPE_CHECKING
 
-from starjax import config
-from starjax.learners import Learner
-from starjax.limits import Count, Positive
+from starjax.core import config
+from starjax.core.learners import Learner
+from starjax.core.limits import Count, Positive
 
 if TYPE_CHECKING:  # it imports jax, which `--help` does without
     from starjax.policies.sequences import SequenceModel, Sizes
@@ -35,8 +35,8 @@ def make(options: BcConfig, policy_config: config.PolicyConfig, sizes: "Sizes") 
     import jax
     import jax.numpy as jnp
 
-    from starjax.models import diffusion, kernels, regression
     from starjax.policies import sequences
+    from starjax.policies.models import diffusion, kernels, regression
     from starjax.policies.sequences import Condition, Params
 
     dtype = jnp.dtype(policy_config.dtype)

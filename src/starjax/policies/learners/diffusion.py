@@ -3,9 +3,9 @@
 import dataclasses
 from typing import TYPE_CHECKING, Annotated
 
-from starjax import config, errors
-from starjax.learners import Learner
-from starjax.limits import Range
+from starjax.core import config, errors
+from starjax.core.learners import Learner
+from starjax.core.limits import Range
 from starjax.policies.learners import unet
 
 if TYPE_CHECKING:  # it imports jax, which `--help` does without
@@ -36,7 +36,7 @@ def make(
     options: DiffusionConfig, policy_config: config.PolicyConfig, sizes: "Sizes"
 ) -> "SequenceModel":
     """Builds the model of these options."""
-    from starjax.models import process
+    from starjax.policies.models import process
 
     diffusion = process.diffusion(options.diffusion_steps, options.ddim_steps)
     return unet.make(options, policy_config, sizes, diffusion)

@@ -6,9 +6,9 @@ Not in the paper. Sources: `models.shortcut`.
 import dataclasses
 from typing import TYPE_CHECKING, Annotated
 
-from starjax import config
-from starjax.learners import Learner
-from starjax.limits import Range
+from starjax.core import config
+from starjax.core.learners import Learner
+from starjax.core.limits import Range
 from starjax.policies.learners import unet
 
 if TYPE_CHECKING:  # it imports jax, which `--help` does without
@@ -27,7 +27,7 @@ def make(
     options: OnestepConfig, policy_config: config.PolicyConfig, sizes: "Sizes"
 ) -> "SequenceModel":
     """Builds the model of these options."""
-    from starjax.models import process
+    from starjax.policies.models import process
 
     return unet.make(options, policy_config, sizes, process.shortcut(options.correct_at))
 

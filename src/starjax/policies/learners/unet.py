@@ -3,11 +3,11 @@
 import dataclasses
 from typing import TYPE_CHECKING, Annotated
 
-from starjax import config, errors
-from starjax.limits import Count, Range
+from starjax.core import config, errors
+from starjax.core.limits import Count, Range
 
 if TYPE_CHECKING:  # they import jax, which `--help` does without
-    from starjax.models.process import Process
+    from starjax.policies.models.process import Process
     from starjax.policies.sequences import SequenceModel, Sizes
 
 
@@ -45,8 +45,8 @@ def make(
     """Builds the model that inverts `process`."""
     import jax.numpy as jnp
 
-    from starjax.models import unet1d
     from starjax.policies import denoiser
+    from starjax.policies.models import unet1d
 
     network = unet1d.ConditionalUnet1D(
         action_dim=sizes.action,

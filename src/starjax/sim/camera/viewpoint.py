@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from starjax.core.types import Pose
 from starjax.sim.camera import geometry, texture, tiles, tissue
-from starjax.types import Pose
 
 # A texture: visible points x, y, z in the camera frame, `[T, Q]` m each, to red, green and blue.
 Look = Callable[[Sequence[Any]], Any]

@@ -3,7 +3,7 @@
 import numpy as np
 
 from starjax.sim import scene
-from starjax.sim.tasks.peg_transfer import task, text
+from starjax.tasks.peg_transfer import task, text
 
 
 def test_the_outline_is_the_models():

@@ -5,9 +5,9 @@ import functools
 from collections.abc import Sequence
 from pathlib import Path
 
-from starjax import errors
 from starjax.addons.finetune import settings
-from starjax.commands import checks, options, policy_args, session
+from starjax.cli import checks, options, policy_args, session
+from starjax.core import errors
 
 DESCRIPTION = """Improves a trained policy in the simulator and writes policy.safetensors.
 

@@ -3,14 +3,14 @@
 from pathlib import Path
 from typing import Any
 
-from starjax import config as config_lib
-from starjax import errors
 from starjax.addons.finetune import dagger, self_imitation
 from starjax.addons.finetune.commands import interventions
 from starjax.addons.finetune.settings import FinetuneConfig
+from starjax.core import config as config_lib
+from starjax.core import errors
 from starjax.data import store
 from starjax.rcm.trocar import Trocar
-from starjax.sim.tasks.base import Task
+from starjax.sim.task import Task
 
 OF_ONE_STEP = ("rl", "distill")  # ways that need a learner of one evaluation
 _ONE_STEP = "onestep"  # that learner

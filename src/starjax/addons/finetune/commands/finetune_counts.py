@@ -3,7 +3,7 @@
 from typing import Any
 
 from starjax.addons.finetune import dagger, rounds
-from starjax.commands import messages
+from starjax.cli import messages
 from starjax.evaluation import statistics
 from starjax.rollouts import progress
 

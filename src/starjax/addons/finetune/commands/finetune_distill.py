@@ -13,7 +13,7 @@ from starjax.addons.finetune import distill, mixing, policy_gradient
 from starjax.addons.finetune.commands import finetune_stages
 from starjax.addons.finetune.commands.finetune_play import NoisyEpisodes, PolicyParams
 from starjax.addons.finetune.commands.finetune_work import Work
-from starjax.commands import messages, stage_times
+from starjax.cli import messages, stage_times
 from starjax.policies import policy_file
 from starjax.policies.in_env import PolicyInEnv
 

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from starjax import errors
 from starjax.addons.finetune import dagger, explore, noise_level
 from starjax.addons.finetune.commands.finetune_work import Work
+from starjax.core import errors
 from starjax.evaluation import statistics
 from starjax.policies import features, generator
 from starjax.policies.base import Policy

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from starjax import config as config_lib
-from starjax import errors, methods
 from starjax.addons.finetune import dagger, mixing, rounds, self_imitation
 from starjax.addons.finetune.commands import finetune_checks, finetune_counts, interventions
 from starjax.addons.finetune.commands.finetune_work import Work
-from starjax.commands import demonstrations, messages, pipeline, policy_evaluation, stage_times
+from starjax.cli import demonstrations, messages, pipeline, policy_evaluation, stage_times
+from starjax.core import config as config_lib
+from starjax.core import errors, methods
 from starjax.data import load, normalizer, store, windows
 from starjax.evaluation import statistics, trials
 from starjax.policies import in_env, policy_file

@@ -16,12 +16,12 @@ import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from starjax import config as config_lib
-from starjax import errors
 from starjax.addons.finetune import mixing
 from starjax.addons.finetune.commands import finetune_checks
 from starjax.addons.finetune.settings import FinetuneConfig
-from starjax.commands import policy_args, session
+from starjax.cli import policy_args, session
+from starjax.core import config as config_lib
+from starjax.core import errors
 from starjax.policies import in_env, policy_file
 from starjax.policies.in_env import PolicyInEnv
 from starjax.rcm.trocar import Trocar

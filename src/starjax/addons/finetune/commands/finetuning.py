@@ -8,12 +8,12 @@ import jax
 import numpy as np
 
 import starjax
-from starjax import errors, methods
 from starjax.addons.finetune.commands import finetune_distill, finetune_rl, finetune_stages
 from starjax.addons.finetune.commands import finetune_work as works
 from starjax.addons.finetune.commands.finetune_work import Work
 from starjax.addons.finetune.settings import FinetuneConfig
-from starjax.commands import messages, policy_args, policy_evaluation, session, stage_times
+from starjax.cli import messages, policy_args, policy_evaluation, session, stage_times
+from starjax.core import errors, methods
 from starjax.evaluation import statistics
 from starjax.runtime import files, precompile, processes
 

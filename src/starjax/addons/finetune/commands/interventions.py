@@ -3,9 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-from starjax import errors
 from starjax.addons.finetune import dagger
 from starjax.addons.finetune.settings import FinetuneConfig
+from starjax.core import errors
 from starjax.data import store
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import takeover

@@ -6,9 +6,9 @@ Beyond rescue: a target that was missed for too long.
 import jax
 import jax.numpy as jnp
 
+from starjax.sim.rescuer import Rescuer, entry
 from starjax.sim.state import EnvState
-from starjax.sim.tasks.endoscope_track import expert, task
-from starjax.sim.tasks.rescue import Rescuer, entry
+from starjax.tasks.endoscope_track import expert, task
 
 NEARLY = 0.6  # fraction of the steps that a success may miss
 

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax.addons.finetune.rescuers import midway, way_in
+from starjax.sim.rescuer import Entry, entry
 from starjax.sim.state import EnvState
-from starjax.sim.tasks import handover, scripting
-from starjax.sim.tasks.rescue import Entry, entry
+from starjax.tasks import handover, scripting
 
 MET = 0.006  # m, distance of the object from the place of the pass, at which the taker comes
 # m, horizontally from its grasp, at which a tip is above it: open jaws have more room

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax.sim.state import EnvState
-from starjax.sim.tasks import phases, scripting
-from starjax.sim.tasks.phases import GraspT
+from starjax.tasks import phases, scripting
+from starjax.tasks.phases import GraspT
 
 ARRIVED = 0.0005  # m from a goal, within which the next phase begins
 OPEN = 0.98  # opening from which jaws count as open, and -OPEN as closed

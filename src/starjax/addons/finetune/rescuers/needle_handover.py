@@ -8,10 +8,10 @@ import jax.numpy as jnp
 
 from starjax.addons.finetune.rescuers import midway, way_in
 from starjax.addons.finetune.rescuers.handover_rescue import before_the_pass, enter, holders, missed
+from starjax.sim.rescuer import Rescuer, entry
 from starjax.sim.state import EnvState
-from starjax.sim.tasks.needle_handover import expert
-from starjax.sim.tasks.needle_pick import task as single
-from starjax.sim.tasks.rescue import Rescuer, entry
+from starjax.tasks.needle_handover import expert
+from starjax.tasks.needle_pick import task as single
 
 OPEN, AWAY, RAISE = map(expert.PHASES.index, ("open", "away", "raise"))
 LEFT = 0.028  # m of a giver from the wire, at which it has left it, on its way or not

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 
 from starjax.addons.finetune.rescuers import midway, way_in
+from starjax.sim.rescuer import Rescuer, entry
 from starjax.sim.state import EnvState
-from starjax.sim.tasks import phases
-from starjax.sim.tasks.needle_pick import expert, task
-from starjax.sim.tasks.phases import APPROACH, DESCEND, RAISE
-from starjax.sim.tasks.rescue import Rescuer, entry
+from starjax.tasks import phases
+from starjax.tasks.needle_pick import expert, task
+from starjax.tasks.phases import APPROACH, DESCEND, RAISE
 
 PUT, FREE = expert.HOLD + 1, expert.HOLD + 2
 ROOM = way_in.Room(pads=0.002, clearance=0.002, top=expert.HOVER)  # 0.7 mm less than there is

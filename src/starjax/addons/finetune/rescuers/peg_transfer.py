@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 
 from starjax.addons.finetune.rescuers import midway, way_in
+from starjax.sim.rescuer import Rescuer, entry
 from starjax.sim.state import EnvState
-from starjax.sim.tasks.peg_transfer import expert, task
-from starjax.sim.tasks.phases import APPROACH, DESCEND, RAISE
-from starjax.sim.tasks.rescue import Rescuer, entry
+from starjax.tasks.peg_transfer import expert, task
+from starjax.tasks.phases import APPROACH, DESCEND, RAISE
 
 GRASP = task.RIM_HEIGHT - expert.GRASP_DROP  # m, of the tip
 HIGH = GRASP + expert.HOVER  # m, at which the tip goes sideways

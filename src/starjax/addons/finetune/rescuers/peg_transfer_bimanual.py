@@ -8,11 +8,11 @@ import jax.numpy as jnp
 
 from starjax.addons.finetune.rescuers import midway
 from starjax.addons.finetune.rescuers.handover_rescue import before_the_pass, enter, holders, missed
+from starjax.sim.rescuer import Rescuer, entry
 from starjax.sim.state import EnvState
-from starjax.sim.tasks import handover
-from starjax.sim.tasks.peg_transfer import task as single
-from starjax.sim.tasks.peg_transfer_bimanual import expert
-from starjax.sim.tasks.rescue import Rescuer, entry
+from starjax.tasks import handover
+from starjax.tasks.peg_transfer import task as single
+from starjax.tasks.peg_transfer_bimanual import expert
 
 ABOVE, LIFT, NEAR, TAKE, OPEN, AWAY, OVER, LOWER, RELEASE, RISE, WAIT = map(
     expert.PHASES.index,

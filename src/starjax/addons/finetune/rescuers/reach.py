@@ -4,11 +4,11 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from starjax.core.types import Command
+from starjax.sim.rescuer import Rescuer, entry
 from starjax.sim.state import EnvState
-from starjax.sim.tasks import scripting
-from starjax.sim.tasks.reach import expert
-from starjax.sim.tasks.rescue import Rescuer, entry
-from starjax.types import Command
+from starjax.tasks import scripting
+from starjax.tasks.reach import expert
 
 
 @flax.struct.dataclass

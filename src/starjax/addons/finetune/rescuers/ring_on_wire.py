@@ -6,10 +6,10 @@ Beyond rescue: a ring that has touched the wire too often.
 import jax
 import jax.numpy as jnp
 
+from starjax.sim.rescuer import Rescuer, entry
 from starjax.sim.state import EnvState
-from starjax.sim.tasks.phases import APPROACH, RAISE
-from starjax.sim.tasks.rescue import Rescuer, entry
-from starjax.sim.tasks.ring_on_wire import expert, task
+from starjax.tasks.phases import APPROACH, RAISE
+from starjax.tasks.ring_on_wire import expert, task
 
 NEARLY = 0.5  # fraction of the touches that a success may have
 HIGH = task.TIP_HOME[2] - task.TIP_SPREAD  # m, the lowest start, from which it approaches

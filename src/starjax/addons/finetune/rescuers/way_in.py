@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from starjax.addons.finetune.rescuers import midway
 from starjax.sim.state import EnvState
-from starjax.sim.tasks import phases
+from starjax.tasks import phases
 
 # m aside for each m above the height at which pads reach the object: demonstrated ways begin so far
 # out, with their spread

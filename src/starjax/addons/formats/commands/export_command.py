@@ -7,9 +7,9 @@ from typing import Annotated
 
 import tyro
 
-from starjax import errors
-from starjax.commands import checks, options
-from starjax.config import Range
+from starjax.cli import checks, options
+from starjax.core import errors
+from starjax.core.config import Range
 from starjax.runtime import files, hub, progress, xla
 
 DESCRIPTION = """Exports demonstrations in another format, from which they can be restored exactly.

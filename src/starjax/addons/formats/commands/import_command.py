@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from starjax import errors
-from starjax.commands import checks, messages, options
+from starjax.cli import checks, messages, options
+from starjax.core import errors
 from starjax.runtime import hub, progress, xla
 
 _PIXELS = 128  # pixels per side of images that --cameras names

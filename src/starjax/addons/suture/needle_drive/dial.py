@@ -16,10 +16,10 @@ from starjax import rcm
 from starjax.addons.suture.needle_drive import expert, grasps, task
 from starjax.addons.suture.tissue import needle as needles
 from starjax.addons.suture.tissue.needle import Bite
+from starjax.core.types import Pose
 from starjax.sim.state import EnvState
-from starjax.sim.tasks.wrist_script import WRIST, tip_of
 from starjax.sim.tools import needle_driver
-from starjax.types import Pose
+from starjax.tasks.wrist_script import WRIST, tip_of
 
 SIZE, TOOL = needles.SH, needle_driver.TOOL
 AROUND = expert.BEFORE + expert.EMERGE / SIZE.radius  # rad, turned before and after the bite

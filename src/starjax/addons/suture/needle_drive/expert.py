@@ -18,11 +18,11 @@ from starjax.addons.suture import slack
 from starjax.addons.suture.needle_drive import task
 from starjax.addons.suture.tissue import needle as needles
 from starjax.addons.suture.tissue.needle import Needle
+from starjax.core.types import Agent, Command, Pose
 from starjax.sim.state import EnvState
-from starjax.sim.tasks import phases, scripting, wrist_script
-from starjax.sim.tasks.phases import APPROACH, DESCEND, RAISE
-from starjax.sim.tasks.wrist_script import tip_of
-from starjax.types import Agent, Command, Pose
+from starjax.tasks import phases, scripting, wrist_script
+from starjax.tasks.phases import APPROACH, DESCEND, RAISE
+from starjax.tasks.wrist_script import tip_of
 
 DRIVE, HOLD = range(3, 5)
 TIMING = phases.PhaseTable(

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax.addons.suture.tissue.needle import Needle
-from starjax.types import Pose
+from starjax.core.types import Pose
 
 # Found by a search over trocars, bites and directions for the least wrist angles: angle
 # on the arc; turn of the jaws about the wire, and in the pads' plane (rad).

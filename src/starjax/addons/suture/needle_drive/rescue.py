@@ -11,10 +11,10 @@ import jax.numpy as jnp
 from starjax.addons.suture.needle_drive import dial, expert, task
 from starjax.addons.suture.tissue import needle as needles
 from starjax.addons.suture.tissue.needle import Needle
+from starjax.core.types import Agent
+from starjax.sim.rescuer import Rescuer
 from starjax.sim.state import EnvState
-from starjax.sim.tasks.phases import APPROACH, RAISE
-from starjax.sim.tasks.rescue import Rescuer
-from starjax.types import Agent
+from starjax.tasks.phases import APPROACH, RAISE
 
 LOW = 0.025  # m, of the tip: below it a needle that turns could touch the pad
 

@@ -18,17 +18,9 @@ from starjax.addons.suture.needle_drive import grasps, text
 from starjax.addons.suture.tissue import driving, hole
 from starjax.addons.suture.tissue import needle as needles
 from starjax.addons.suture.tissue.needle import Bite, Needle
+from starjax.core.types import Pose
 from starjax.sim import bodies, endoscope_camera, workspaces
-from starjax.sim.tasks.base import (
-    Coupling,
-    Field,
-    SimReadings,
-    Slot,
-    StepReadings,
-    Task,
-    TaskStatus,
-)
-from starjax.types import Pose
+from starjax.sim.task import Coupling, Field, SimReadings, Slot, StepReadings, Task, TaskStatus
 
 if TYPE_CHECKING:  # a robot loads tasks without the simulator
     import mujoco

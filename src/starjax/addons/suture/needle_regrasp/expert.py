@@ -11,11 +11,11 @@ import numpy as np
 
 from starjax import rcm
 from starjax.addons.suture.needle_regrasp import task
+from starjax.core.types import Agent, Command, Pose
 from starjax.sim.state import EnvState
-from starjax.sim.tasks import phases, scripting, wrist_script
-from starjax.sim.tasks.phases import APPROACH, DESCEND, RAISE
-from starjax.sim.tasks.wrist_script import WRIST, WristScript
-from starjax.types import Agent, Command, Pose
+from starjax.tasks import phases, scripting, wrist_script
+from starjax.tasks.phases import APPROACH, DESCEND, RAISE
+from starjax.tasks.wrist_script import WRIST, WristScript
 
 CLOSE, LIFT, HOLD = range(3, 6)
 TIMING = phases.PhaseTable(

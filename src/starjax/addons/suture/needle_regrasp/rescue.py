@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 
 from starjax.addons.suture.needle_regrasp import expert, task
+from starjax.core.types import Command
+from starjax.sim.rescuer import Rescuer, entry
 from starjax.sim.state import EnvState
-from starjax.sim.tasks.phases import APPROACH, RAISE
-from starjax.sim.tasks.rescue import Rescuer, entry
-from starjax.sim.tasks.wrist_script import WristScript
-from starjax.types import Command
+from starjax.tasks.phases import APPROACH, RAISE
+from starjax.tasks.wrist_script import WristScript
 
 HIGH_ENOUGH = task.pick.LIFT + 0.003  # m from the needle's rest to the lifted tip, the least
 

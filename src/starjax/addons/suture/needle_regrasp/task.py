@@ -14,10 +14,10 @@ import numpy as np
 
 from starjax import rcm
 from starjax.addons.suture.needle_regrasp import text
+from starjax.core.types import Pose
 from starjax.sim import bodies, endoscope_camera, workspaces
-from starjax.sim.tasks.base import SimReadings, Slot, Task, TaskStatus
-from starjax.sim.tasks.needle_pick import task as pick
-from starjax.types import Pose
+from starjax.sim.task import SimReadings, Slot, Task, TaskStatus
+from starjax.tasks.needle_pick import task as pick
 
 if TYPE_CHECKING:  # a robot loads tasks without the simulator
     import mujoco

@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from starjax.sim.tasks import outlines
-from starjax.sim.tasks.base import Outline, TaskText
+from starjax.sim.task import Outline, TaskText
+from starjax.tasks import outlines
 
 TEXT = TaskText(
     title="needle regrasp",

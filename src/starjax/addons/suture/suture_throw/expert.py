@@ -16,10 +16,10 @@ import jax.numpy as jnp
 from starjax.addons.suture.needle_drive import grasps
 from starjax.addons.suture.suture_throw import far_grasp, task
 from starjax.addons.suture.tissue import needle as needles
+from starjax.core.types import Agent, Command, Pose
 from starjax.sim.state import EnvState
-from starjax.sim.tasks import phases, scripting, wrist_script
-from starjax.sim.tasks.wrist_script import tip_of
-from starjax.types import Agent, Command, Pose
+from starjax.tasks import phases, scripting, wrist_script
+from starjax.tasks.wrist_script import tip_of
 
 (
     APPROACH, DESCEND, CLOSE, LIFT, OVER, DOWN, DRIVE, OPEN, BACK, AROUND, REACH, TAKE, OUT, PULL,

@@ -11,7 +11,7 @@ import numpy as np
 
 from starjax.addons.suture.tissue import needle as needles
 from starjax.addons.suture.tissue.needle import Needle
-from starjax.types import Pose
+from starjax.core.types import Pose
 
 FROM_POINT = 0.002  # m of wire from the point to the jaws' middle
 # Turns of the jaws about the wire, and their leans in the pads' plane, rad, of both grasps.

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from starjax.addons.suture.suture_throw import expert, far_grasp, task
 from starjax.addons.suture.tissue import needle as needles
 from starjax.sim import ik
+from starjax.sim.rescuer import Rescuer, entry
 from starjax.sim.state import EnvState
-from starjax.sim.tasks.rescue import Rescuer, entry
 
 LOW = 0.035  # m, of the tip: below it the jaws open and go back before anything else
 NEAR = 0.025  # m from tip to needle: as LOW

@@ -19,16 +19,9 @@ from starjax.addons.suture.suture_throw import text
 from starjax.addons.suture.tissue import driving
 from starjax.addons.suture.tissue import needle as needles
 from starjax.addons.suture.tissue.needle import Bite
+from starjax.core.types import Pose
 from starjax.sim import bodies
-from starjax.sim.tasks.base import (
-    CONTROL_HZ,
-    Coupling,
-    Field,
-    SimReadings,
-    StepReadings,
-    TaskStatus,
-)
-from starjax.types import Pose
+from starjax.sim.task import CONTROL_HZ, Coupling, Field, SimReadings, StepReadings, TaskStatus
 
 SIZE = needles.CT1
 BITES = (0.008, 0.010)  # m between the marks: the wrist turns such a bite to 6 mm of wire out

@@ -1,6 +1,6 @@
 """Phrases of suture throw, for reports."""
 
-from starjax.sim.tasks.base import TaskText
+from starjax.sim.task import TaskText
 
 TEXT = TaskText(
     title="suture throw",

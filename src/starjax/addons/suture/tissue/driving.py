@@ -14,7 +14,7 @@ import numpy as np
 from starjax.addons.suture.tissue import hole, patch
 from starjax.addons.suture.tissue import rows as bodies
 from starjax.addons.suture.tissue.needle import Needle
-from starjax.types import Pose
+from starjax.core.types import Pose
 
 GRAVITY = 9.81
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from starjax.addons.suture.tissue import needle as needles
 from starjax.addons.suture.tissue import rows as bodies
 from starjax.addons.suture.tissue.needle import Needle
-from starjax.types import Pose
+from starjax.core.types import Pose
 
 # Force of piercing (N): soft skin asks a needle holder for 0.70 N (mpatkin.org, tests of seven
 # laparoscopic needle holders). All other constants are assumed.

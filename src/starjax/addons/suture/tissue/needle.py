@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from starjax.types import Pose
+from starjax.core.types import Pose
 
 STEEL = 7900.0  # kg/m^3
 SEGMENTS = 7  # straight parts of the drawn and weighed wire

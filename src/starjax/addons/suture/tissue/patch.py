@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from starjax.addons.suture.tissue import needle as needles
 from starjax.addons.suture.tissue import rows as bodies
 from starjax.addons.suture.tissue.needle import Needle
+from starjax.core.types import Pose
 from starjax.sim import ik
-from starjax.types import Pose
 
 # N per pad: the torque limit of the dVRK's jaws (0.16 N m, LARGE_NEEDLE_DRIVER_400006.json) over
 # both jaws at the tip, 10.2 mm from their axis.

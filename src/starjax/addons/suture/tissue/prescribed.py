@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from starjax.addons.suture.tissue import driving
 from starjax.addons.suture.tissue import rows as bodies
 from starjax.addons.suture.tissue.needle import Needle
+from starjax.core.types import Pose
 from starjax.sim import ik
-from starjax.types import Pose
 
 
 class DriveMoment(NamedTuple):

@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.spatial.transform import Rotation
 
+from starjax.core.types import Pose
 from starjax.sim import iteration, linear
-from starjax.types import Pose
 
 MAX_ITERATIONS = 12
 ACCURACY = 1e-5  # relative, of the impulses

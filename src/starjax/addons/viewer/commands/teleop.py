@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from starjax import config as config_lib
-from starjax import errors
 from starjax.addons.viewer.commands.view import Port
-from starjax.commands import checks, options, policy_args
-from starjax.limits import Range
+from starjax.cli import checks, options, policy_args
+from starjax.core import config as config_lib
+from starjax.core import errors
+from starjax.core.limits import Range
 from starjax.policies import packaged
 from starjax.runtime import jax_start, signals, xla
 

@@ -5,10 +5,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-from starjax import config as config_lib
-from starjax import errors
-from starjax.commands import checks, folders, options
-from starjax.limits import Range
+from starjax.cli import checks, folders, options
+from starjax.core import config as config_lib
+from starjax.core import errors
+from starjax.core.limits import Range
 from starjax.policies import packaged
 from starjax.runtime import hub, jax_start, signals, xla
 

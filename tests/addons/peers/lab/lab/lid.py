@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax.sim.tasks import scripting
-from starjax.sim.tasks.base import CONTROL_HZ, Field, Outline, Slot, Task, TaskStatus, TaskText
-from starjax.types import Agent, Command
+from starjax.core.types import Agent, Command
+from starjax.sim.task import CONTROL_HZ, Field, Outline, Slot, Task, TaskStatus, TaskText
+from starjax.tasks import scripting
 
 HINGE = jnp.array([-0.015, 0.0, 0.009])  # m
 KNOB = (0.030, 0.007)  # m from the hinge, along and above the plate

@@ -2,8 +2,8 @@
 
 import dataclasses
 
-from starjax.commands import presets
-from starjax.methods import METHODS
+from starjax.cli import presets
+from starjax.core.methods import METHODS
 
 BLIND = METHODS["dp_rcm4"]._replace(sees_trocar=False, weights_of="", label="", group="")
 BRIEF = dataclasses.replace(

@@ -2,8 +2,8 @@
 
 import dataclasses
 
-from starjax.learners import Learner
-from starjax.limits import Positive
+from starjax.core.learners import Learner
+from starjax.core.limits import Positive
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -1,0 +1,183 @@
+"""`starjax stress`: scores a trained policy under disturbances, one at a time."""
+
+import dataclasses
+import importlib.util
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from starjax.cli import benchmark_args, messages, options, policy_args, scenes, session
+from starjax.core import config as config_lib
+from starjax.core import errors
+from starjax.core.limits import NotNegative
+from starjax.core.registry import Rows
+from starjax.evaluation import disturbances, protocol
+from starjax.runtime import files
+
+DESCRIPTION = """Scores a trained policy on its task's trocars under disturbances.
+
+RUN is the directory of a method, such as runs/cpu/stardiff. --policy takes a policy.safetensors or
+the name of a packaged policy instead. Nothing is retrained. Each disturbance has several levels,
+the first of which is zero; all levels run the same trials. Rerun the same command to resume.
+
+Examples:
+  starjax stress --policy compact --disturbance breathing smoke
+  starjax stress --policy compact --disturbance camera=5 blood=0.05
+  starjax stress runs/cpu/stardiff --disturbance trocar_offset --levels 0 0.005"""
+
+
+_TRIALS = config_lib.TrialsConfig(trials=4, time_limit_s=30.0, video_trials=0)
+
+
+@dataclasses.dataclass(frozen=True)
+class StressArgs(benchmark_args.BenchmarkArgs, policy_args.PolicyArgs):
+    """Flags of the command."""
+
+    # disturbances to test, NAME or NAME=LEVEL for 0 and that level; default: all that apply to this
+    # policy
+    disturbance: tuple[str, ...] = ()
+    # levels of a single disturbance, in its unit; default: its own
+    levels: tuple[NotNegative, ...] = ()
+    together: tuple[str, ...] = ()  # NAME=LEVEL of disturbances to test at once as well
+    seed: config_lib.Seed = 0  # random seed of the trials
+    # directory of the result; auto: one in RUN or in runs/stress
+    out: str = options.AUTO
+    eval: config_lib.TrialsConfig = _TRIALS
+
+
+def main(argv: Sequence[str]) -> int:
+    """Runs the missing trials; writes stress.json, its table and its figure."""
+    args = options.parse("stress", StressArgs, argv, DESCRIPTION)
+    benchmark_args.check(args, StressArgs())
+    path = policy_args.resolve(args)
+    trials = benchmark_args.label() if args.benchmark else f"seed{args.seed}"
+    folder = path.folder("stress", [trials], args.out)
+    chosen = disturbances.chosen_levels("disturbance", args.disturbance)
+    if args.levels and (len(chosen) != 1 or any(chosen.values())):
+        got = ", ".join(args.disturbance) or "none"
+        raise errors.UsageError("levels", "exactly one --disturbance, without a level", got)
+    args = dataclasses.replace(args, disturbance=tuple(chosen))
+    started = session.start("stress", argv, folder)
+    together = disturbances.parse_levels("together", args.together)
+    who, _ = policy_args.load(path)
+    args = benchmark_args.with_trials(args, "stress", who.env.names.task)
+    kinds = _kinds(args, chosen, who.trained.policy.observation, who.env.names.tools)
+    _check_together(together, list(kinds))
+    who = _disturbed(who, list(kinds))
+    content = {
+        "benchmark_version": protocol.VERSION,
+        "scene": who.env.names._asdict(),
+        "method": who.trained.method,
+        "weights": who.weights,
+        **({"server": who.origin} if path.address else {}),
+        "seed": args.seed,
+        "trials_at_each_trocar": args.eval.trials,
+        "time_limit_s": args.eval.time_limit_s,
+        "disturbances": {},
+    }
+    with started.shared() as share:
+        for name, kind in kinds.items():
+            print(f"{name}: {kind.description}", flush=True)
+            rows = {"what": kind.description, "unit": kind.unit, "levels": {}}
+            content["disturbances"][name] = rows
+            for level in args.levels or chosen.get(name) or kind.levels:
+                trials = folder / (f"{name}-{level:g}" if level else "0")
+                levels = {**dict.fromkeys(kinds, 0.0), name: level}
+                score = rows["levels"][f"{level:g}"] = _score(trials, who, levels, args)
+                print(_line(f"{level:g} {kind.unit}", score), flush=True)
+                if share.is_first:
+                    started.write("stress.json", content)
+        if together:
+            trials = folder / "-".join(f"{name}-{level:g}" for name, level in together.items())
+            score = _score(trials, who, {**dict.fromkeys(kinds, 0.0), **together}, args)
+            content["together"] = {"levels": together, **score}
+            print(f"{' '.join(args.together)}\n{_line('together', score)}", flush=True)
+        if share.is_first:
+            started.write("stress.json", content)
+            _draw(folder)
+        print(f"\nresult: {folder / 'stress.json'}")
+    return 0
+
+
+def _draw(folder: Path) -> None:
+    """Writes the table and the figure if matplotlib is installed."""
+    if importlib.util.find_spec("matplotlib") is None:
+        return
+    from starjax.report import stress
+
+    for name, data in stress.files(files.read_json(folder / "stress.json")).items():
+        files.write_bytes(folder / name, data)
+
+
+def _kinds(
+    args: StressArgs,
+    chosen: Mapping[str, Sequence[float]],
+    observation: str,
+    tools: Sequence[str],
+) -> dict[str, Any]:
+    """Returns the requested disturbances, by default all that apply to observation and tools.
+
+    Raises:
+      errors.UsageError: a disturbance of images is requested for a policy without images, one of
+        wrists for tools without any, or a level that a disturbance does not have.
+    """
+    from starjax.evaluation.disturbances import base
+
+    registry = disturbances.DISTURBANCES
+    kinds = {name: registry.get(name) for name in args.disturbance}
+    kinds = kinds or dict(Rows(registry))  # without those of broken packages
+    for name in args.disturbance:
+        if observation != "image" and kinds[name].image_only:
+            raise errors.UsageError("disturbance", "one that applies to states", name)
+        base.check_tools("disturbance", name, tools)
+        base.check_levels("levels", name, args.levels)
+        base.check_levels("disturbance", name, chosen[name])
+    kinds = {name: kind for name, kind in kinds.items() if base.suits(kind, tools)}
+    return {n: kind for n, kind in kinds.items() if observation == "image" or not kind.image_only}
+
+
+def _check_together(levels: dict[str, float], tested: list[str]) -> None:
+    """Checks the disturbances that are tested at once.
+
+    Raises:
+      errors.UsageError: one of them is not tested alone, or has no such level.
+    """
+    from starjax.evaluation.disturbances import base
+
+    for name, level in levels.items():
+        errors.choice("together", name, tested)
+        base.check_levels("together", name, [level])
+
+
+def _disturbed(who: Any, names: list[str]) -> Any:
+    """Returns the policy in an environment whose one program has every level of all of these."""
+    from starjax.evaluation.disturbances import base
+
+    env = scenes.disturbable(who.env, names, who.trained.policy)
+    return who._replace(env=base.with_disturbances(env, names))
+
+
+def _score(folder: Path, who: Any, levels: dict[str, float], args: StressArgs) -> dict[str, Any]:
+    """Returns success, RCM error, force on the abdominal wall and alarms in a level's trials."""
+    from starjax.cli import policy_evaluation
+    from starjax.evaluation import alarms, statistics, wall
+
+    trocars = who.env.task.trocars
+    table = policy_evaluation.rollouts(folder, who, trocars, args.eval, args.seed, levels)
+    monitor = policy_evaluation.monitor_of(who, args.eval)
+    return {
+        "strict": statistics.rate(table.success),
+        "safe": statistics.rate(table.safe),
+        "invalid": int(table.invalid.sum()),
+        "rcm_error_mm": statistics.rcm_error_mm(table),
+        "wall_force_N": wall.force(table, who.env.control_hz),
+        **({"alarms": alarms.compose(table, monitor)} if monitor else {}),
+    }
+
+
+def _line(level: str, score: dict[str, Any]) -> str:
+    strict, errors_mm = score["strict"], score["rcm_error_mm"]["executed"]
+    rate = f"{strict['successes']}/{strict['trials']} = {100 * strict['rate']:.0f}%"
+    error = f"RCM error {errors_mm['mean']:.3f} mm, p99 {errors_mm['p99']:.2f}"
+    line = f"  {level:10} {rate:16} {error}; wall {score['wall_force_N']['p99']:.2f} N"
+    return f"{line}\n{'':13}{messages.alarms(score['alarms'])}" if "alarms" in score else line

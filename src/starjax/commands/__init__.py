@@ -1,1 +1,0 @@
-"""The commands: one module each, named in `starjax.cli`."""

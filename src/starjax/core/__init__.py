@@ -1,0 +1,1 @@
+"""Records, errors, registries and settings that every part of starjax uses."""

@@ -1,0 +1,103 @@
+"""Common parts of scripted experts: smooth motion, jaws, rolls, and a disturbance to correct.
+
+A policy that plans anew every few steps cannot tell how long a demonstration has stood still. So
+motions spend little time near rest, and jaws are waited for no longer than they take to arrive.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from starjax import rcm
+from starjax.core.types import Command
+from starjax.sim.state import EnvState
+from starjax.sim.task import CONTROL_HZ
+
+NOISE_STREAM = 1 << 20  # folded into the key: distinct from every attempt's stream
+CORRELATION = 0.4  # s, correlation time of the disturbance
+SMOOTHING = 0.15  # s, time constant of its low-pass, for smooth motion
+SLOPE = 0.15  # part of a way's time, at either end, in which its speed changes
+JAW_TIME = 0.25  # s to close or open
+JAW_DELAY = 2.0 / CONTROL_HZ  # s, for which jaws are waited for at most
+SHUT = 0.0  # opening below which jaws that touch something have it between them
+OPENED = 0.8  # opening from which jaws are clear of an object
+
+
+def sloped(fraction: jax.Array) -> jax.Array:
+    """Returns the fraction of the way after a fraction `[...]` of the time, at constant speed.
+
+    Its speed grows and falls evenly during `SLOPE` of the time at either end.
+    """
+    left = jnp.minimum(fraction, 1.0 - fraction)
+    done = jnp.where(left < SLOPE, left**2 / (2.0 * SLOPE), left - SLOPE / 2.0) / (1.0 - SLOPE)
+    return jnp.where(fraction < 0.5, done, 1.0 - done)
+
+
+def jaws(before: jax.Array, target: jax.Array, elapsed: jax.Array) -> jax.Array:
+    """Returns the openings `[...]` `elapsed` s after the start of a motion to `target`."""
+    most = 2.0 * elapsed / JAW_TIME
+    return before + jnp.clip(target - before, -most, most)
+
+
+def is_of_jaws(jaws: np.ndarray | tuple[float, ...]) -> np.ndarray:
+    """Returns `[P]` bool, True for phases in which jaws move, from their openings `[P, ...]`.
+
+    The openings are those at the phases' ends. Such a phase ends once the jaws have arrived.
+    """
+    ends = np.reshape(jaws, (len(jaws), -1))
+    return (np.diff(ends, axis=0, prepend=ends[:1]) != 0.0).any(-1)
+
+
+def jaw_limit(before: jax.Array, target: jax.Array) -> jax.Array:
+    """Returns the longest time (s) of a phase of jaws, from openings `[...]` to `target`."""
+    return jnp.max(jnp.abs(target - before)) * JAW_TIME / 2.0 + JAW_DELAY
+
+
+def have_arrived(target: jax.Array, state: EnvState) -> jax.Array:
+    """Returns True once jaws `[A]` on their way to `target` grip, or are open."""
+    is_sent = state.gripper_target < target + 1e-3
+    grip = is_sent & state.touch & (state.gripper < SHUT)
+    return jnp.all(jnp.where(target < 0.0, grip, state.gripper > OPENED))
+
+
+def command(roll: jax.Array, p: jax.Array, jaws: jax.Array, state: EnvState) -> Command:
+    """Returns the command `[A]` of rolls `[A]` rad, tips `[A, 3]` m and jaws `[A]`.
+
+    Shafts pass the measured trocars.
+    """
+    action = jnp.concatenate([roll[:, None], p], axis=-1)
+    pose, _ = rcm.ACTION_SPACES["rcm4"].decode(action, state.measured_trocar)
+    return Command(pose, jaws)
+
+
+def turn_to(normal: jax.Array, R: jax.Array) -> jax.Array:
+    """Returns the roll `[A]` (rad) that opens jaws along `normal` `[A, 3]`.
+
+    `R` `[A, 3, 3]` are the tools' rotations at roll 0.
+    """
+    across = jnp.einsum("ai,aij->aj", normal, R, precision="highest")
+    return jnp.arctan2(-across[:, 0], across[:, 1])
+
+
+def nearer_half(turned: jax.Array, roll: jax.Array) -> jax.Array:
+    """Returns `turned` rad plus a multiple of half a turn (jaws are symmetric), next to `roll`."""
+    return roll + (turned - roll + jnp.pi / 2) % jnp.pi - jnp.pi / 2
+
+
+def disturb(key: jax.Array, noise: jax.Array, step: jax.Array, deviation: jax.Array) -> jax.Array:
+    """Advances an Ornstein-Uhlenbeck process and its low-passed copy.
+
+    Args:
+      key: of the episode.
+      noise: `[2, n]`, the last rough and smooth values.
+      step: int32, the control step.
+      deviation: `[n]`, standard deviation of the rough one.
+    """
+    dt = 1.0 / CONTROL_HZ
+    keep = jnp.exp(-dt / CORRELATION)
+    drawn = jax.random.normal(
+        jax.random.fold_in(jax.random.fold_in(key, NOISE_STREAM), step), deviation.shape
+    )
+    rough = keep * noise[0] + deviation * jnp.sqrt(1.0 - keep**2) * drawn
+    smooth = noise[1] + dt / SMOOTHING * (rough - noise[1])
+    return jnp.stack([rough, smooth])
