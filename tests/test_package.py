@@ -32,6 +32,7 @@ HOSTS = {
     "127.0.0.1",
     "arxiv.org",
     "doi.org",
+    "colab.research.google.com",
     "docs.jax.dev",
     "docs.python.org",
     "flax.readthedocs.io",

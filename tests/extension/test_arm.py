@@ -1,4 +1,4 @@
-"""An arm from outside of starjax, in a scene; `tests/commands/test_run.py` runs it through."""
+"""An arm from outside of starjax, in a scene; `tests/cli/test_run.py` runs it through."""
 
 import importlib
 import sys
