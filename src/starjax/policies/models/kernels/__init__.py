@@ -1,7 +1,8 @@
 """Variants of parts of the networks that are faster on one kind of device.
 
-One file holds one variant. Its first lines name the reference that it equals, its function `pays`
-decides from the device and the shapes if it is used, and tests/models/kernels compares the two.
+One file holds one variant. Its first lines name the reference that it equals, and its function
+`pays` decides from the device and the shapes if it is used; tests/policies/models/kernels compares
+the two.
 `choose` is the only door: to drop a variant, delete its file and its line of `VARIANTS`.
 """
 
