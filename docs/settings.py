@@ -30,8 +30,8 @@ def comments(settings: type) -> dict[str, str]:
     return texts
 
 
-def rows(settings: type, default: object, prefix: str = "") -> list[tuple[str, str, str, str]]:
-    """Returns (flag, type, default, help) of every field, including nested ones."""
+def rows(settings: type, default: object, prefix: str = "") -> list[tuple[str, str, str]]:
+    """Returns (flag, default, help) of every field, including nested ones."""
     table_rows, helps = [], comments(settings)
     inline = {
         field.name for field in dataclasses.fields(settings) if field.metadata == limits.INLINE
@@ -48,22 +48,17 @@ def rows(settings: type, default: object, prefix: str = "") -> list[tuple[str, s
             continue
         is_word = options.tyro.conf.Positional in getattr(hint, "__metadata__", ())
         flag = name.upper() if is_word else options.flag(prefix + name)
-        table_rows.append((flag, takes(hint), shown(value), helps[name]))
+        table_rows.append((flag, shown(value), helps[name] + choices(hint)))
     return table_rows
 
 
-def takes(hint: object) -> str:
-    """Returns a field's type and range in words."""
-    limit = limits.within(hint)
+def choices(hint: object) -> str:
+    """Returns the values that a field can have, if they are few."""
     while typing.get_origin(hint) is typing.Annotated:
         hint = typing.get_args(hint)[0]
-    if typing.get_origin(hint) is typing.Literal:
-        return ", ".join(f"`{choice}`" for choice in typing.get_args(hint))
-    several = typing.get_origin(hint) is tuple
-    kind = typing.get_args(hint)[0] if several or typing.get_args(hint) else hint
-    words = {int: "whole number", float: "number", str: "text", bool: "switch"}.get(kind, "text")
-    words = f"{words}s" if several else words
-    return f"{words}, {limit}" if limit else words
+    if typing.get_origin(hint) is not typing.Literal:
+        return ""
+    return f" ({', '.join(f'`{choice}`' for choice in typing.get_args(hint))})"
 
 
 def shown(value: object) -> str:
@@ -89,24 +84,20 @@ def is_flags(kind: object, module: str) -> bool:
 def commands() -> str:
     """Returns a section per command, with its flags."""
     parts = []
-    for name, (module, summary, needed) in cli.COMMANDS.items():
+    for name, (module, summary, _) in cli.COMMANDS.items():
         module, _, function = module.partition(":")
         loaded = importlib.import_module(module)
         description = getattr(loaded, function.upper() or "DESCRIPTION", f"{summary}.")
         flags_of = [kind for kind in vars(loaded).values() if is_flags(kind, module)]
         text, _, examples = description.partition("\n\nExamples:\n")
-        parts += ["", f"## starjax {name}", "", text]
+        parts += ["", f"## starjax {name}", "", text.partition("\n\n")[0]]
         parts += ["", "```bash", *map(str.strip, examples.splitlines()), "```"]
-        parts += ["", f"Needs the extras {', '.join(f'`{extra}`' for extra in needed)}."]
         if name in ("run", "collect", "train"):
-            parts += [
-                "",
-                "Flags: the [settings of a run](config.md), and `--track tensorboard` or `wandb`.",
-            ]
+            parts += ["", "Flags: the [settings of a run](config.md)."]
         elif flags_of:
             lines = rows(flags_of[0], flags_of[0])
             lines = [(f"`{flag}`", *rest) for flag, *rest in lines]
-            parts += ["", table(["flag", "takes", "default", "meaning"], lines)]
+            parts += ["", table(["flag", "default", "meaning"], lines)]
     return "\n".join(parts) + "\n"
 
 
@@ -121,18 +112,18 @@ def settings() -> str:
         first, dot, _ = row[0].removeprefix("--").partition(".")
         groups.setdefault(first if dot else "run", []).append(row)
     changed = {
-        name: {flag: value for flag, _, value, _ in rows(config.RunConfig, preset)}
+        name: {flag: value for flag, value, _ in rows(config.RunConfig, preset)}
         for name, preset in presets.PRESETS.items()
     }
     for group, lines in groups.items():
         parts += ["", f"## {group}", ""]
         drawn = []
-        for flag, kind, value, text in lines:
+        for flag, value, text in lines:
             cells = [changed[name].get(flag, "–") for name in names]  # not an option of its learner
             differs = [cell if cell != value and group != "run" else "" for cell in cells]
-            drawn.append((f"`{flag}`", value, differs, kind, text))
+            drawn.append((f"`{flag}`", value, differs, text))
         used = [i for i in range(len(names)) if any(line[2][i] for line in drawn)]
         lines = [(flag, value, *(d[i] for i in used), *rest) for flag, value, d, *rest in drawn]
-        head = ["flag", "default", *(names[i] for i in used), "takes", "meaning"]
+        head = ["flag", "default", *(names[i] for i in used), "meaning"]
         parts.append(table(head, lines))
     return "\n".join(parts) + "\n"

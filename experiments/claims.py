@@ -1,4 +1,4 @@
-"""Pages of results: a folder each, with claim.toml, results and pictures, drawn as its README.
+"""Pages of results: a folder each, with claim.toml, results and pictures, drawn as its README.md.
 
 A page has one study, or several in folders of their own (`studies`). claim.toml has of a page:
 
@@ -6,6 +6,7 @@ A page has one study, or several in folders of their own (`studies`). claim.toml
     picture                  {file, text}, or {of, text} of a picture that `pictures.py` draws
     film                     an mp4 file
     studies                  folders of its studies, if there are several
+    short                    true to leave conditions and commands of the studies to tables.md
 
 and of a study:
 
@@ -13,10 +14,12 @@ and of a study:
     date, code               its date, and the code's version if the results name no commit
     commands                 the commands that made the results
     rows_are                 header of the first column, default "Method"
+    shown                    rows of the first table that the page shows, default all
     notes                    conditions, one list item each
     [runs]                   name in the tables -> result file
     [[tables]]               title, text, and either name, columns (of `columns.COLUMNS`) and rows
-                             (default all), or draw: a table of `tables.py`; the first is in sight
+                             (default all), or draw: a table of `tables.py`; all but the first
+                             stand in tables.md
     [[pairs]]                name, title, rows [[a, b], ...], part (of `columns.PARTS`)
     [[figures]]              file, text
 
@@ -38,6 +41,8 @@ from starjax.report import formats
 
 HERE = Path(__file__).parent
 PICTURE = "success.png"  # drawn by pictures.py
+TABLES = "tables.md"
+DETAILS = ("gap", "tip", "roll", "seeds", "code", "loose", "rcm_won")  # columns of tables.md alone
 # Pages by group, in the order of the paper.
 GROUPS = {
     "The paper": ("methods", "training_trocars", "main_job", "packaged_policies"),
@@ -87,13 +92,16 @@ def folders() -> list[Path]:
     ]
 
 
-def table(study: Study, name: str, rows: Sequence[str] | None = None) -> str:
+def table(
+    study: Study, name: str, rows: Sequence[str] | None = None, without: Sequence[str] = ()
+) -> str:
     """Returns a table of the study as markdown.
 
     Args:
       study: the study.
       name: name of one of its tables or pairs.
       rows: names of the runs to show, None for those of claim.toml.
+      without: columns that are omitted.
 
     Raises:
       KeyError: the study has no table of that name.
@@ -101,8 +109,9 @@ def table(study: Study, name: str, rows: Sequence[str] | None = None) -> str:
     for spec in study.spec.get("tables", []):
         if spec.get("name") == name:
             runs = [study.runs[row] for row in rows or spec.get("rows", study.runs)]
-            header = [_rows_are(study), *(columns.COLUMNS[column][0] for column in spec["columns"])]
-            draws = [columns.COLUMNS[column][1] for column in spec["columns"]]
+            drawn = [columns.COLUMNS[name] for name in spec["columns"] if name not in without]
+            header = [_rows_are(study), *(head for head, _ in drawn)]
+            draws = [draw for _, draw in drawn]
             body = [[run.run.label, *(draw(run) for draw in draws)] for run in runs]
             return formats.render([header, *body], names=1)
     for spec in study.spec.get("pairs", []):
@@ -115,19 +124,33 @@ def table(study: Study, name: str, rows: Sequence[str] | None = None) -> str:
 
 def readme(page: Study, draw: Callable[[str], str]) -> str:
     """Returns the text of a page; `draw` returns the table of a name of `tables.py`."""
-    spec, names = page.spec, page.spec.get("studies", [])
+    spec, studies = page.spec, _studies(page)
     parts = [f"# {spec['title']}", f"*{spec['question']}*", filled(page, spec["answer"])]
     picture = spec["picture"]
     parts.append(f"![{picture['text']}]({picture.get('file', PICTURE)})")
     if "film" in spec:
         parts.append(f"[Film of the picture above]({spec['film']})")
-    for name in names:
-        study = load(page.folder / name)
-        parts += [f"## {study.spec['title']}", filled(study, study.spec["answer"])]
-        parts += _study(study, page.folder, draw)
-    if not names:
-        parts += _study(page, page.folder, draw)
+    for study in studies:
+        if study is not page:
+            parts += [f"## {study.spec['title']}", filled(study, study.spec["answer"])]
+        parts += _study(page, study, draw)
+    if further(page, draw):
+        name = f"experiments/{page.folder.name}/{TABLES}"
+        what = "Commands, conditions" if spec.get("short") else "Paired tests"
+        parts.append(f"{what} and further tables: [`{name}`]({TABLES}).")
     return "\n\n".join(parts) + "\n"
+
+
+def further(page: Study, draw: Callable[[str], str]) -> str:
+    """Returns whole tables and further figures of a page, nothing if its text has them all."""
+    parts = []
+    for study in _studies(page):
+        drawn = [_drawn(study, spec, draw) for spec in _tables(study)[0 if _is_cut(study) else 1 :]]
+        drawn += [_figure(page, study, one) for one in _figures(page, study)[1:]]
+        drawn += _origin(study) if page.spec.get("short") else []
+        parts += [f"## {study.spec['title']}", *drawn] if drawn else []
+    title = f"# Further tables: {page.spec['title']}"
+    return "\n\n".join([title, "[The page](README.md).", *parts]) + "\n" if parts else ""
 
 
 def filled(study: Study, text: str) -> str:
@@ -159,37 +182,64 @@ def provenance(study: Study) -> str:
 
 
 def index() -> str:
-    """Returns a table per group of pages: title, question and answer."""
+    """Returns a table per group of pages: title and answer."""
     parts = []
     for group, names in GROUPS.items():
-        rows = [["Page", "Question", "Answer"]]
+        rows = [["Page", "Answer"]]
         for name in names:
             page = load(HERE / name)
             link = f"[{page.spec['title']}]({name}/README.md)"
-            rows.append([link, page.spec["question"], filled(page, page.spec["answer"])])
-        parts += [f"### {group}", formats.render(rows, 3)]
+            rows.append([link, filled(page, page.spec["answer"])])
+        parts += [f"### {group}", formats.render(rows, 2)]
     return "\n\n".join(parts)
 
 
-def _study(study: Study, page: Path, draw: Callable[[str], str]) -> list[str]:
-    """Returns tables, figures, notes, commands and origin; all tables but one are folded."""
-    spec, drawn = study.spec, []
-    for one in [*spec.get("tables", []), *spec.get("pairs", [])]:
-        body = draw(one["draw"]) if "draw" in one else table(study, one["name"])
-        head = f"**{one['title']}.** {one.get('text', '')}".strip()
-        drawn.append((one["title"], f"{head}\n\n{body}"))
-    parts = [text for _, text in drawn[:1]]
-    for figure in spec.get("figures", []):
-        file = os.path.relpath(study.folder / figure["file"], page)
-        parts.append(f"![{figure['text']}]({file})")
-    if spec.get("notes"):
-        parts.append("\n".join(f"- {note}" for note in spec["notes"]))
-    if drawn[1:]:
-        titles = "; ".join(title.replace("`", "") for title, _ in drawn[1:])
-        parts.append(f'<details markdown="1">\n<summary>Further tables: {titles}</summary>')
-        parts += [text for _, text in drawn[1:]]
-        parts.append("</details>")
-    return [*parts, f"```bash\n{spec['commands'].strip()}\n```", provenance(study)]
+def _studies(page: Study) -> list[Study]:
+    """Returns the studies of a page, which is one itself if it has no others."""
+    return [load(page.folder / name) for name in page.spec.get("studies", [])] or [page]
+
+
+def _tables(study: Study) -> list[dict[str, Any]]:
+    return [*study.spec.get("tables", []), *study.spec.get("pairs", [])]
+
+
+def _figures(page: Study, study: Study) -> list[dict[str, Any]]:
+    """Returns the figures of a study without the page's picture."""
+    picture = page.folder / page.spec["picture"].get("file", PICTURE)
+    figures = study.spec.get("figures", [])
+    return [one for one in figures if (study.folder / one["file"]).resolve() != picture.resolve()]
+
+
+def _figure(page: Study, study: Study, figure: dict[str, Any]) -> str:
+    return f"![{figure['text']}]({os.path.relpath(study.folder / figure['file'], page.folder)})"
+
+
+def _is_cut(study: Study) -> bool:
+    """Returns True if the page shows a part of the first table."""
+    first = _tables(study)[0]
+    return "shown" in study.spec or bool(set(DETAILS) & set(first.get("columns", [])))
+
+
+def _drawn(study: Study, spec: dict[str, Any], draw: Callable[[str], str], text: str = "") -> str:
+    """Returns a table, or `text` as its rows, with its title."""
+    body = text or (draw(spec["draw"]) if "draw" in spec else table(study, spec["name"]))
+    return f"**{spec['title']}.** {spec.get('text', '')}".strip() + f"\n\n{body}"
+
+
+def _study(page: Study, study: Study, draw: Callable[[str], str]) -> list[str]:
+    """Returns the first table, a figure and, on most pages, conditions, commands and provenance."""
+    spec, first = study.spec, _tables(study)[0]
+    short = table(study, first["name"], spec.get("shown"), DETAILS) if _is_cut(study) else ""
+    parts = [_drawn(study, first, draw, short)]
+    parts += [_figure(page, study, one) for one in _figures(page, study)[:1]]
+    return parts if page.spec.get("short") else [*parts, *_origin(study)]
+
+
+def _origin(study: Study) -> list[str]:
+    """Returns conditions, commands and provenance."""
+    notes = ["\n".join(f"- {note}" for note in study.spec.get("notes", []))]
+    commands = f"```bash\n{study.spec['commands'].strip()}\n```"
+    return [*filter(None, notes), commands, provenance(study)]
 
 
 def _rows_are(study: Study) -> str:

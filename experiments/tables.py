@@ -69,7 +69,10 @@ def table(name: str) -> str:
 def pages() -> Iterator[tuple[Path, str]]:
     """Yields every page with drawn tables, and the text that it must hold."""
     for folder in claims.pages():
-        yield folder / "README.md", claims.readme(claims.load(folder), table)
+        page = claims.load(folder)
+        yield folder / "README.md", claims.readme(page, table)
+        if text := claims.further(page, table):
+            yield folder / claims.TABLES, text
     marked = [ROOT / "README.md", ROOT / "benchmarks" / "README.md", HERE / "README.md"]
     for page in [*marked, *sorted((ROOT / "docs").rglob("*.md"))]:
         yield page, redraw(page.read_text(), table)

@@ -27,6 +27,8 @@ def test_every_page_is_drawn_from_results(pages):
     """If this fails: python experiments/tables.py."""
     for page, text in pages:
         assert page.read_text() == text, page
+    drawn = {page for page, _ in pages if page.name == "tables.md"}
+    assert drawn == set(pages[0][0].parents[1].rglob("tables.md"))
 
 
 def test_a_number_that_is_not_in_a_result_is_seen(tables):
