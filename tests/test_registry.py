@@ -9,6 +9,7 @@ import pytest
 from starjax import cli, rcm
 from starjax.cli import policy_args, presets, run_settings
 from starjax.core import config, errors, extensions, methods, registry
+from starjax.data import normalizer
 from starjax.sim import registries
 
 
@@ -115,7 +116,8 @@ GROUPS = {
 def test_methods_spaces_presets_encoders_and_policies_are_parts_too(install, capsys, tmp_path):
     install("lab_i", PARTS, **GROUPS)
     row = methods.METHODS["blind"]
-    assert (row.weights_of, row.label, row.keeps_to_manifold) == ("blind", "blind", True)
+    assert (row.weights_of, row.label) == ("blind", "blind")
+    assert normalizer.keeps_to_manifold(row)
     assert list(methods.METHODS)[-1] == "blind" and "blind" not in methods.TABLE_II
     assert list(methods.SCORED).index(methods.SERVED) < list(methods.SCORED).index("blind")
     assert [part.code for part in methods.parts("blind")] == ["lab_i:BLIND", "lab_i:RCM4_AGAIN"]

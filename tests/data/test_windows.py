@@ -11,7 +11,7 @@ from starjax.core import methods
 from starjax.core.methods import METHODS
 from starjax.data import normalizer, windows
 
-STRAIGHT = {name: row for name, row in METHODS.items() if not row.has_wrist}
+STRAIGHT = {name: row for name, row in METHODS.items() if not normalizer.has_wrist(row)}
 
 
 @pytest.fixture(scope="module")

@@ -48,7 +48,7 @@ def toy(**changed):
 
 
 QUICK = {"dp_ee", "stardiff"}  # one of each kind of policy
-STRAIGHT = [name for name, row in METHODS.items() if not row.has_wrist]
+STRAIGHT = [name for name, row in METHODS.items() if not normalizer.has_wrist(row)]
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from starjax.policies import policy as policies
 from starjax.policies.models import encoders, roll_net
 from starjax.policies.models.kernels import packed_params, sampling_unet
 
-STRAIGHT = [name for name, row in METHODS.items() if not row.has_wrist]  # others need a wrist
+STRAIGHT = [name for name, row in METHODS.items() if not normalizer.has_wrist(row)]
 TRAIN = config.TrainConfig(state_noise=0.0)
 SEEN = features.select_sensors(fakes.TASK)
 B = 4

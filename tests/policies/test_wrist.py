@@ -20,8 +20,8 @@ WRIST = rcm.LARGE_NEEDLE_DRIVER
 TASK = fakes.task(slots=tuple(s._replace(tool="needle_driver") for s in fakes.TASK.slots))
 TRAIN = config.TrainConfig(state_noise=0.0)
 FRAMES = np.arange(80)
-NAMES = [name for name, row in METHODS.items() if row.has_wrist]
-ON_MANIFOLD = [name for name in NAMES if METHODS[name].keeps_to_manifold]
+NAMES = [name for name, row in METHODS.items() if normalizer.has_wrist(row)]
+ON_MANIFOLD = [name for name in NAMES if normalizer.keeps_to_manifold(METHODS[name])]
 
 
 def jit(fn):

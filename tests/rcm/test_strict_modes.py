@@ -52,7 +52,8 @@ GIVEN = {
     "trocar_position": (TROCAR, POINT),
     "trocar_rotation": (TROCAR,),
 }
-SPACES = [*rcm.ACTION_SPACES.values(), rcm.rcm6(WRIST)]
+STRAIGHT = [space for space in rcm.ACTION_SPACES.values() if space.for_wrist is None]
+SPACES = [*STRAIGHT, rcm.rcm6(WRIST)]
 WRISTED = {
     "angles_through": (POSE, POINT),
     "shaft_of": (POSE, drawn(2)),

@@ -113,9 +113,11 @@ def _methods() -> Iterator[Row]:
 
 
 def _method(row: methods.Method) -> str:
-    given = {"rcm6": "roll and wrist", "se3_through": "the turn about a held wire"}
-    rolls = f"; a network for {given.get(row.action_space, 'the roll')}" * row.hierarchical
-    rolls += "; moves a wrist" * row.has_wrist
+    from starjax.rcm import ACTION_SPACES
+
+    space = ACTION_SPACES.registry.get(row.action_space)
+    rolls = f"; a network for {' and '.join(space.turns)}" * row.hierarchical
+    rolls += "; moves a wrist" * (space.for_wrist is not None)
     condition = "; conditioned on the trocar" * row.sees_trocar + "; projected" * row.projects
     return f"{row.label}: actions {row.action_space}{rolls}{condition}"
 

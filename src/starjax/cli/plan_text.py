@@ -182,11 +182,14 @@ def _scene_of(encoder_weights: str) -> Any:
 
 def _ablations(method: str, policy: config_lib.PolicyConfig) -> list[str]:
     """Returns the active ablations: settings that deviate from the method's row."""
+    from starjax.policies import policy as policies
+
     rows = [methods.SCORED[name] for name in methods.selected(method)]
-    sees, yaw = policy.sees_trocar, policy.trocar_yaw
+    sees = policy.sees_trocar
     given = "given" if sees == "always" else "not given"
     is_conditioned = sees != "method" and any(row.sees_trocar != (sees == "always") for row in rows)
-    turned = yaw == "fixed" and any(row.action_space in ("rcm1", "rcm2") for row in rows)
+    spaces = {policies.ablated(row, policy).action_space for row in rows}
+    turned = not spaces <= {row.action_space for row in rows}
     rolls = any(row.hierarchical for row in rows)
     active = {
         f"the learner's model is {given} the trocar (--policy.sees-trocar {sees})": is_conditioned,

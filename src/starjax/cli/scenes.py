@@ -70,7 +70,8 @@ def check_wrists(scene: config_lib.SceneConfig, selected: Sequence[str]) -> None
     for name in selected:
         row = methods.METHODS[name]
         normalizer.wrist_of(row, wrists.holding(task, names(scene)))
-        if needs_wrist and not row.has_wrist:
-            known = ", ".join(name for name, one in methods.METHODS.items() if one.has_wrist)
+        if needs_wrist and not normalizer.has_wrist(row):
+            rows = methods.METHODS.items()
+            known = ", ".join(name for name, one in rows if normalizer.has_wrist(one))
             expected = f"one that moves a wrist, for task {scene.task}"
             raise errors.UsageError("method", expected, name, known)

@@ -14,7 +14,7 @@ class Method(NamedTuple):
     """A row of Table II, or a further one.
 
     Attributes:
-      action_space: key of `starjax.rcm.ACTION_SPACES`, or of `WRIST_SPACES`.
+      action_space: key of `starjax.rcm.ACTION_SPACES`.
       sees_trocar: the learner's model is conditioned on the trocar; the roll network always is.
       projects: poses are projected onto the RCM manifold at execution.
       hierarchical: the learner for (position, gripper), or (pose, gripper), and a network for the
@@ -33,20 +33,6 @@ class Method(NamedTuple):
     label: str = ""
     group: str = ""
 
-    @property
-    def keeps_to_manifold(self) -> bool:
-        """True if executed poses are on the RCM manifold."""
-        return self.projects or self.action_space not in _FREE_SHAFTS
-
-    @property
-    def has_wrist(self) -> bool:
-        """True if it commands wrist angles, which a tool with a wrist is needed for."""
-        return self.action_space in WRIST_SPACES
-
-
-# Action spaces of instruments with a wrist, see `rcm.action_space`.
-WRIST_SPACES = ("rcm6", "se3_wrist", "se3_through")
-_FREE_SHAFTS = ("se3", "se3_wrist")  # spaces whose poses ignore the trocar
 
 _NAIVE, _RCM, _OURS = "Naive", "RCM action spaces", "Ours"
 _BESIDE, _OTHERS, _WRIST = "Ours (ablation)", "Other packages", "With a wrist"

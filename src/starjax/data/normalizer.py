@@ -25,8 +25,6 @@ from starjax.sim import wrists
 from starjax.sim.task import Field, Task
 
 _SMALLEST_RANGE = 1e-4  # m or rad: below it an entry counts as constant, and is only centred
-# Action spaces whose positions are the world's, at every trocar.
-_ABSOLUTE = ("se3", "rcm4", *methods.WRIST_SPACES)
 _EDGE_AZIMUTHS = 16  # for trocars on the edge of Eq. 19: between two of them up to 1 mm is missing
 
 
@@ -79,13 +77,13 @@ def encode(
       pose: of the tips, `[..., A]`.
       gripper: `[..., A]`.
       trocar: frames, broadcastable against the poses.
-      wrist: of the tools, for a space of `methods.WRIST_SPACES`.
-      angles: `[..., A, 2]` rad of the wrist, for `se3_wrist`; without them the shaft is taken to
-        pass through the trocar.
+      wrist: of the tools, for a space with `for_wrist`.
+      angles: `[..., A, 2]` rad of the wrist, for such a space that is free; without them the shaft
+        is taken to pass through the trocar.
     """
     space = rcm.action_space(action_space, wrist)
     encoded = space.encode(pose, trocar)
-    if angles is not None and action_space == "se3_wrist":
+    if angles is not None and wrist is not None and space.is_free:
         encoded = encoded.at[..., space.slices["wrist"]].set(angles)
     vector = jnp.concatenate([encoded, jnp.asarray(gripper)[..., None]], axis=-1)
     return vector.reshape(*vector.shape[:-2], -1)
@@ -115,9 +113,9 @@ def fit(
 
     actions = windows.over_frames(dataset, frames, lambda _, *rest: encode_commands(*rest))
     space = rcm.action_space(method.action_space, wrist)
-    action = _min_max(actions, _entries_but(space, task.arms, "R"))
-    if method.action_space not in _ABSOLUTE:
-        action = action.replace(reach=_reach(action, space, task, dataset, frames))
+    action = _min_max(actions, entries_but(space, task.arms, "R"))
+    if not space.is_absolute:
+        action = action.replace(reach=_reach(action, space, task, dataset, frames, wrist))
     state = None
     if dataset.observation.state is not None:
         states = windows.over_frames(dataset, frames, lambda observation, *_: observation.state)
@@ -131,8 +129,18 @@ def shapes(method: methods.Method, task: Task, state: bool) -> Normalizer:
     size = task.arms * (space.dim + 1)
     ends = [jax.ShapeDtypeStruct((n,), jnp.float32) for n in (size, task.state_size)]
     reach = jax.ShapeDtypeStruct((2, size), jnp.float32)
-    action = MinMax(ends[0], ends[0], None if method.action_space in _ABSOLUTE else reach)
+    action = MinMax(ends[0], ends[0], None if space.is_absolute else reach)
     return Normalizer(action, MinMax(ends[1], ends[1]) if state else None)
+
+
+def keeps_to_manifold(method: methods.Method) -> bool:
+    """Returns True if executed poses are on the RCM manifold."""
+    return method.projects or not rcm.ACTION_SPACES.registry.get(method.action_space).is_free
+
+
+def has_wrist(method: methods.Method) -> bool:
+    """Returns True if a method commands wrist angles, which a tool with a wrist is needed for."""
+    return rcm.ACTION_SPACES.registry.get(method.action_space).for_wrist is not None
 
 
 def wrist_of(method: methods.Method, task: Task) -> rcm.Wrist | None:
@@ -141,7 +149,7 @@ def wrist_of(method: methods.Method, task: Task) -> rcm.Wrist | None:
     Raises:
       errors.UsageError: it commands angles, and the task's tools have no wrist or different ones.
     """
-    if not method.has_wrist:
+    if not has_wrist(method):
         return None
     wrist = wrists.common(task)
     if wrist is None:
@@ -152,7 +160,12 @@ def wrist_of(method: methods.Method, task: Task) -> rcm.Wrist | None:
 
 
 def _reach(
-    box: MinMax, space: rcm.ActionSpace, task: Task, dataset: windows.Dataset, frames: np.ndarray
+    box: MinMax,
+    space: rcm.ActionSpace,
+    task: Task,
+    dataset: windows.Dataset,
+    frames: np.ndarray,
+    wrist: rcm.Wrist | None,
 ) -> jax.Array:
     """Returns the scaled range `[2, A * (dim + 1)]` that reaches demonstrated tips.
 
@@ -169,8 +182,11 @@ def _reach(
     def ends(command):
         def through(trocar):
             frame = rcm.trocar_frame(trocar, p_world_ref, roll_zero)
-            pose = rcm.project(command.pose, frame.p_world_trocar)
-            scaled = box.normalize(encode(space.name, pose, command.gripper, frame))
+            if wrist is None:
+                pose = rcm.project(command.pose, frame.p_world_trocar)
+            else:
+                pose = rcm.through(wrist, command.pose, frame.p_world_trocar).pose
+            scaled = box.normalize(encode(space.name, pose, command.gripper, frame, wrist))
             return scaled.min(axis=0), scaled.max(axis=0)
 
         low, high = jax.vmap(through)(trocars)
@@ -178,15 +194,15 @@ def _reach(
 
     # 1. range of each entry over all frames, through every extreme trocar
     edge = windows.over_frames(dataset, frames, lambda _, command, __: ends(command))
-    # 2. union with [-1, 1]; rotations and rolls keep that range, whatever the trocar
+    # 2. union with [-1, 1]; rotations, rolls and wrists keep that range, whatever the trocar
     reach = np.stack([np.full(edge.shape[-1], -1.0), np.full(edge.shape[-1], 1.0)])
-    counted = _entries_but(space, task.arms, "R", "roll")
+    counted = entries_but(space, task.arms, "R", "roll", "wrist")
     reach[0, counted] = np.minimum(edge[:, counted].min(axis=0), -1.0)
     reach[1, counted] = np.maximum(edge[:, counted].max(axis=0), 1.0)
     return jnp.asarray(reach, jnp.float32)
 
 
-def _entries_but(space: rcm.ActionSpace, arms: int, *names: str) -> np.ndarray:
+def entries_but(space: rcm.ActionSpace, arms: int, *names: str) -> np.ndarray:
     """Returns the indices of all parts of the arms' actions except those of these names."""
     parts = [part for name, part in space.slices.items() if name not in names]
     of_one = np.concatenate([np.arange(part.start, part.stop) for part in parts])

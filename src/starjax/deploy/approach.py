@@ -92,7 +92,7 @@ def _is_outside(
     space = rcm.ACTION_SPACES[action_space]
     encoded = normalizer.encode(action_space, measured, jnp.zeros(measured.p.shape[:-1]), trocar)
     scaled = stats.action.normalize(encoded).reshape(*measured.p.shape[:-1], space.dim + 1)
-    coordinates = space.slices["p"] if "p" in space.slices else space.slices["depth"]
+    coordinates = normalizer.entries_but(space, 1, "R", "roll")
     return (jnp.abs(scaled[..., coordinates]) > 1.0 + OUTSIDE).any(-1)
 
 

@@ -199,9 +199,12 @@ def load(
     row = methods.METHODS[method]
     task = wrists.holding(registries.tasks.get(trained.scene.task), trained.scene)
     wrist = normalizer.wrist_of(row, task)
-    if wrist is not None and not row.keeps_to_manifold:
+    keeps = normalizer.keeps_to_manifold(row)
+    if wrist is not None and not keeps:
         expected = "one whose shaft passes the trocar"
-        raise errors.UsageError("method", expected, method, "dp_ee_proj_wrist has these weights")
+        others = [name for name in sharing if methods.METHODS[name].projects]
+        hint = f"{', '.join(others)} has these weights" if others else ""
+        raise errors.UsageError("method", expected, method, hint)
     made = policies.make(row, settings, task, cameras=trained.scene.cameras)
     params = made.prepare_for_inference(trained.params)
     p_world_ref = np.asarray(trained.p_world_ref, np.float32)
@@ -210,15 +213,14 @@ def load(
         moments=settings.obs_horizon,
         arms=arms,
         p_world_ref=p_world_ref if arms else p_world_ref[0],
-        keeps_to_manifold=row.keeps_to_manifold,
+        keeps_to_manifold=keeps,
         image_size=settings.image_size,
         cameras=trained.scene.cameras if settings.observation == "image" else (),
         state_size=task.state_size,
         regions=trocar_region.of_task(task),
         wrist=() if wrist is None else tuple(wrist),
     )
-    is_straight = row.keeps_to_manifold and wrist is None
-    approach_space = row.action_space if is_straight else None
+    approach_space = row.action_space if keeps and wrist is None else None
     infer = _inference(made.sample, trained, p_world_ref, not arms, approach_space, wrist)
     return Deployed(
         method=method,

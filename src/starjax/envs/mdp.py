@@ -27,7 +27,7 @@ from starjax import rcm
 from starjax.core import errors, extras
 from starjax.core.types import Command, Pose
 from starjax.envs import ranges, trocar_draws
-from starjax.envs.settings import WRIST_SPACES, EnvSettings
+from starjax.envs.settings import EnvSettings
 
 SHARE = 0.1  # part of half an action's range, in a control step: of a tip 0.15 m/s, as the arms can
 
@@ -90,7 +90,7 @@ def make(settings: EnvSettings) -> Episodes:
         cameras=settings.cameras,
     )
     task, space = env.task, _space(settings, env.task)
-    bends = space.name in WRIST_SPACES
+    bends = space.for_wrist is not None
     low, high = (jnp.asarray(end) for end in ranges.actions(task, space))
     is_relative = settings.control == "relative"
     draw = trocar_draws.make(task, settings.trocar)
@@ -157,14 +157,16 @@ def _space(settings: EnvSettings, task: Any) -> rcm.ActionSpace:
     """Returns the action space of the settings for a task with its tools.
 
     Raises:
-      errors.UsageError: it is one of a wrist, which the tools lack.
+      errors.UsageError: it is one for wrists, which the tools lack, or is free as well.
     """
     from starjax.sim import registries, wrists
 
     needs_wrist = any(wrists.per_arm(registries.tasks.get(settings.task)))
     name = settings.action_space or ("rcm6" if needs_wrist else "rcm4")
-    wrist = wrists.common(task)
-    if name in WRIST_SPACES and wrist is None:
+    wrist, space = wrists.common(task), rcm.ACTION_SPACES[name]
+    if space.for_wrist and space.is_free:
+        raise errors.UsageError("action_space", "one on the manifold, for wrists", name)
+    if space.for_wrist and wrist is None:
         tools = " ".join(slot.tool for slot in task.slots)
         raise errors.UsageError("tools", f"one kind of wrist, for actions {name}", tools)
     return rcm.action_space(name, wrist)

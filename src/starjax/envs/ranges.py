@@ -6,7 +6,6 @@ import jax
 import numpy as np
 
 from starjax import rcm
-from starjax.envs.settings import WRIST_SPACES
 from starjax.sim import registries
 from starjax.sim.task import Task
 
@@ -51,7 +50,7 @@ def actions(task: Task, space: rcm.ActionSpace) -> tuple[np.ndarray, np.ndarray]
         encoded = np.asarray(encode(pose, frame)).reshape(-1, space.dim)
         lowest, highest = encoded.min(axis=0), encoded.max(axis=0)
         bounds.append((lowest, highest))
-        if space.name in WRIST_SPACES:
+        if space.for_wrist is not None:
             _widen(space, lowest, highest, registries.tools.get(slot.tool).wrist)
     low, high = (np.stack(ends).astype(np.float32) for ends in zip(*bounds, strict=True))
     return low, high

@@ -10,7 +10,6 @@ from starjax.core import errors
 from starjax.core.config import DEFAULT_TASK
 
 CONTROLS = ("relative", "absolute")
-WRIST_SPACES = ("rcm6", "se3_through")  # on the manifold, for tools with a wrist
 REWARDS = ("dense", "sparse")
 OBSERVATIONS = ("state", "image")
 TROCARS = ("seen", "unseen", "all", "random")
@@ -30,8 +29,8 @@ class EnvSettings:
         configurations; `random`: uniformly in the workspace's ranges (Eq. 19); a whole number:
         that configuration of the task; a position (x, y, z) in m, `[3]` or `[A, 3]`, or a
         `rcm.Trocar` with fields `[]` or `[A]`: this one.
-      action_space: key of `rcm.ACTION_SPACES`; for tools with a wrist also `rcm6` or `se3_through`.
-        Empty for `rcm4`, and for `rcm6` in a task that needs a wrist.
+      action_space: key of `rcm.ACTION_SPACES`; one for wrists keeps to the manifold. Empty for
+        `rcm4`, and for `rcm6` in a task that needs a wrist.
       control: actions `relative` to the measured pose, or `absolute`, see `mdp`.
       reward: `dense` or `sparse`, see `mdp`.
       observation: `state` (numbers) or `image` (pixels, and numbers of the tool).
@@ -71,7 +70,7 @@ def make(**arguments: Any) -> EnvSettings:
         arguments["trocar"] = _trocar(arguments["trocar"])
     settings = EnvSettings(**arguments)
     if settings.action_space:
-        errors.choice("action_space", settings.action_space, [*rcm.ACTION_SPACES, *WRIST_SPACES])
+        errors.choice("action_space", settings.action_space, rcm.ACTION_SPACES)
     errors.choice("control", settings.control, CONTROLS)
     errors.choice("reward", settings.reward, REWARDS)
     errors.choice("observation", settings.observation, OBSERVATIONS)

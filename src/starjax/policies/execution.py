@@ -37,7 +37,7 @@ def command(
     angles = None
     if wrist is None:
         pose = rcm.project(pose, frame.p_world_trocar) if method.projects else pose
-    elif method.keeps_to_manifold:  # a feasible pose stays as it is
+    elif normalizer.keeps_to_manifold(method):  # a feasible pose stays as it is
         pose, angles, _ = rcm.through(wrist, pose, frame.p_world_trocar)
     else:
         limit = jnp.array([wrist.pitch, wrist.yaw])

@@ -55,9 +55,9 @@ def make(
     """Builds the hierarchical policy in an action space of (turns, position)."""
     wrist = normalizer.wrist_of(method, sensors.task)
     space = rcm.action_space(method.action_space, wrist)
-    if set(space.slices) not in ({"roll", "p"}, {"roll", "wrist", "p"}):
+    if not space.turns or tuple(space.slices) != (*space.turns, "p"):
         raise ValueError(
-            f"method.action_space: expected one of roll and position, got {method.action_space!r}"
+            f"method.action_space: expected one of turns and position, got {method.action_space!r}"
         )
     arms, position, turns = sensors.task.arms, space.slices["p"], slice(space.slices["p"].start)
     outputs = turns.stop  # N: the position is the last part

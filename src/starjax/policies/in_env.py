@@ -59,7 +59,7 @@ def batch_agent(
       wrist: that it commands, see `normalizer.wrist_of`.
     """
     if average_plans:
-        keeps = methods.SCORED[method].keeps_to_manifold
+        keeps = normalizer.keeps_to_manifold(methods.SCORED[method])
         return ensemble.from_policy(policy.sample, settings.obs_horizon, keeps, wrist)
     return agent.from_policy(policy.sample, settings.obs_horizon, settings.execute)
 

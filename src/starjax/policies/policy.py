@@ -40,7 +40,7 @@ def make(
     method = ablated(method, policy_config)
     build = single.make
     if method.hierarchical:
-        by_pose = method.action_space == "se3_through"
-        build = pose_hierarchy.make if by_pose else hierarchical.make
+        turns = rcm.ACTION_SPACES.registry.get(method.action_space).turns
+        build = pose_hierarchy.make if turns == ("R",) else hierarchical.make
     sensors = features.select_sensors(task, cameras)
     return build(method, policy_config, sensors, train_config or config.TrainConfig())

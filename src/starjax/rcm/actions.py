@@ -18,7 +18,7 @@ one of Eq. 3, its roll and rotation those of the pose. NaN inputs give NaN.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,7 @@ from starjax.core import types
 from starjax.core.registry import Registry, Rows
 from starjax.rcm import arrays, manifold, rotations
 from starjax.rcm import trocar as trocars
+from starjax.rcm import wrist as wrists
 
 MAX_REACH = 10.0  # m; bound of a decoded SE(3) position's coordinates
 
@@ -45,7 +46,14 @@ class ActionSpace(NamedTuple):
       encode: (pose_world_tip `[...]`, trocar `[...]`, p_world_ref `[..., 3]` m) to `[..., A]`.
       decode: (action `[..., A]`, trocar, p_world_ref) to (pose_world_tip, valid bool `[...]`).
         Both also take a `TrocarFrame` `[...]` in place of trocar and reference.
-      slices: positions of the parts "p" m, "R" 6-D, "depth" m, "roll" rad.
+      slices: positions of the parts "p" m, "R" 6-D, "depth" m, "roll" rad, "wrist" `[2]` rad.
+      is_absolute: positions are in the world frame, the same at every trocar.
+      is_free: the shaft of a decoded pose need not pass the trocar.
+      turns: parts that the small network of a hierarchical policy predicts: all before "p", the
+        last part; or "R" alone, of which it corrects the turn about the tip's x axis. Empty if the
+        space has no such policy.
+      for_wrist: wrist -> this space for instruments with that wrist; None for straight ones. If it
+        `is_free`, its part "wrist" is what is commanded.
     """
 
     name: str
@@ -53,6 +61,10 @@ class ActionSpace(NamedTuple):
     encode: Encode
     decode: Decode
     slices: dict[str, slice]
+    is_absolute: bool = False
+    is_free: bool = False
+    turns: tuple[str, ...] = ()
+    for_wrist: Callable[[wrists.Wrist], "ActionSpace"] | None = None
 
 
 def _encode_se3(pose: types.Pose, frame: "SpaceFrame") -> list[jax.Array]:
@@ -134,7 +146,17 @@ def _down(dtype: jnp.dtype) -> jax.Array:
     return jnp.diag(jnp.array([1.0, -1.0, -1.0], dtype))
 
 
-def make_space(name: str, encode: Callable, decode: Callable, **sizes: int) -> ActionSpace:
+def make_space(
+    name: str,
+    encode: Callable,
+    decode: Callable,
+    *,
+    is_absolute: bool = False,
+    is_free: bool = False,
+    turns: tuple[str, ...] = (),
+    for_wrist: Callable[[wrists.Wrist], ActionSpace] | None = None,
+    **sizes: int,
+) -> ActionSpace:
     """Wraps a pair of maps: checks, broadcasts and bounds the inputs, inserts the hold pose."""
     slices, dim = {}, 0
     for part, size in sizes.items():
@@ -183,7 +205,18 @@ def make_space(name: str, encode: Callable, decode: Callable, **sizes: int) -> A
         p = jnp.where(valid[..., None], pose.p, hold.p)
         return types.Pose(R=R, p=p), valid
 
-    return ActionSpace(name, dim, encode_pose, decode_action, slices)
+    return ActionSpace(
+        name, dim, encode_pose, decode_action, slices, is_absolute, is_free, turns, for_wrist
+    )
+
+
+def without_wrist(space: ActionSpace) -> ActionSpace:
+    """Returns the row of a space `for_wrist`: its facts, and maps that raise ValueError."""
+
+    def refuse(*_: object) -> NoReturn:
+        raise ValueError(f"wrist: expected that of a tool for the action space {space.name}")
+
+    return space._replace(encode=refuse, decode=refuse)
 
 
 def _trocar_arguments(trocar: Where, p_world_ref: ArrayLike | None) -> dict:
@@ -221,17 +254,27 @@ def _hold_pose(p_world_trocar: jax.Array) -> types.Pose:
 
 
 _BUILT_IN = {
-    "se3": make_space("se3", _encode_se3, _decode_se3, p=3, R=6),
+    "se3": make_space("se3", _encode_se3, _decode_se3, is_absolute=True, is_free=True, p=3, R=6),
     "rcm1": make_space("rcm1", _encode_rcm1, _decode_rcm1, depth=1, R=6),
-    "rcm2": make_space("rcm2", _encode_rcm2, _decode_rcm2, roll=1, p=3),
+    "rcm2": make_space("rcm2", _encode_rcm2, _decode_rcm2, turns=("roll",), roll=1, p=3),
     "rcm3": make_space("rcm3", _encode_rcm3, _decode_rcm3, depth=1, R=6),
-    "rcm4": make_space("rcm4", _encode_rcm4, _decode_rcm4, roll=1, p=3),
+    "rcm4": make_space(
+        "rcm4", _encode_rcm4, _decode_rcm4, is_absolute=True, turns=("roll",), roll=1, p=3
+    ),
     "rcm1_fixed_yaw": make_space(
         "rcm1_fixed_yaw", _fixed_yaw(_encode_rcm1), _fixed_yaw(_decode_rcm1), depth=1, R=6
     ),
     "rcm2_fixed_yaw": make_space(
-        "rcm2_fixed_yaw", _fixed_yaw(_encode_rcm2), _fixed_yaw(_decode_rcm2), roll=1, p=3
+        "rcm2_fixed_yaw",
+        _fixed_yaw(_encode_rcm2),
+        _fixed_yaw(_decode_rcm2),
+        turns=("roll",),
+        roll=1,
+        p=3,
     ),
+    "rcm6": "starjax.rcm.wrist_actions:RCM6",
+    "se3_through": "starjax.rcm.wrist_actions:SE3_THROUGH",
+    "se3_wrist": "starjax.rcm.wrist_actions:SE3_WRIST",
 }
 # Other packages add theirs by an entry point of the group `starjax.action_spaces`.
 ACTION_SPACES = Rows(Registry("action_space", _BUILT_IN, "starjax.rcm.actions:ActionSpace"))

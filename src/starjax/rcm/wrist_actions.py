@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax.core import errors
 from starjax.core.types import Pose
 from starjax.rcm import actions, arrays, rotations, wrist_checks
 from starjax.rcm import wrist as wrists
@@ -52,7 +51,8 @@ def rcm6(wrist: wrists.Wrist) -> actions.ActionSpace:
         R = rotations.rotation_from_axis_roll(axis * _G, roll)
         return wrists.tip_of(wrist, wrists.shaft_at(R, depth, bend, frame.p), angles)
 
-    return actions.make_space("rcm6", encode, decode, roll=1, wrist=2, p=3)
+    facts = {"is_absolute": True, "turns": ("roll", "wrist"), "for_wrist": rcm6}
+    return actions.make_space("rcm6", encode, decode, **facts, roll=1, wrist=2, p=3)
 
 
 def se3_through(wrist: wrists.Wrist) -> actions.ActionSpace:
@@ -70,7 +70,8 @@ def se3_through(wrist: wrists.Wrist) -> actions.ActionSpace:
     def decode(parts: dict[str, jax.Array], frame: actions.SpaceFrame) -> Pose:
         return wrists.through(wrist, _free_pose(parts), frame.p).pose
 
-    return actions.make_space("se3_through", encode, decode, p=3, R=6)
+    facts = {"is_absolute": True, "turns": ("R",), "for_wrist": se3_through}
+    return actions.make_space("se3_through", encode, decode, **facts, p=3, R=6)
 
 
 def se3_wrist(wrist: wrists.Wrist) -> actions.ActionSpace:
@@ -91,10 +92,14 @@ def se3_wrist(wrist: wrists.Wrist) -> actions.ActionSpace:
     def decode(parts: dict[str, jax.Array], frame: actions.SpaceFrame) -> Pose:
         return _free_pose(parts)
 
-    return actions.make_space("se3_wrist", encode, decode, p=3, R=6, wrist=2)
+    facts = {"is_absolute": True, "is_free": True, "for_wrist": se3_wrist}
+    return actions.make_space("se3_wrist", encode, decode, **facts, p=3, R=6, wrist=2)
 
 
-_WITH_WRIST = {"rcm6": rcm6, "se3_through": se3_through, "se3_wrist": se3_wrist}
+RCM6, SE3_THROUGH, SE3_WRIST = (
+    actions.without_wrist(make(wrists.LARGE_NEEDLE_DRIVER))
+    for make in (rcm6, se3_through, se3_wrist)
+)
 
 
 @functools.lru_cache
@@ -102,18 +107,18 @@ def action_space(name: str, wrist: wrists.Wrist | None = None) -> actions.Action
     """Returns an action space by name.
 
     Args:
-      name: key of `ACTION_SPACES`, or `rcm6`, `se3_through` or `se3_wrist`.
-      wrist: of the instrument, for the last three.
+      name: key of `ACTION_SPACES`.
+      wrist: of the instrument, for a space with `for_wrist`.
 
     Raises:
-      ValueError: an unknown name, or one of these without a wrist.
+      ValueError: an unknown name, or a space for wrists without one.
     """
-    errors.choice("action_space", name, [*actions.ACTION_SPACES.registry.names(), *_WITH_WRIST])
-    if name not in _WITH_WRIST:
-        return actions.ACTION_SPACES[name]
+    space = actions.ACTION_SPACES.registry.get(name)
+    if space.for_wrist is None:
+        return space
     if wrist is None:
         raise ValueError(f"wrist: expected that of a tool for the action space {name}, got None")
-    return _WITH_WRIST[name](wrist)
+    return space.for_wrist(wrist)
 
 
 def _free_pose(parts: dict[str, jax.Array]) -> Pose:

@@ -7,6 +7,7 @@ import jax
 from starjax import rcm
 from starjax.cli import presets
 from starjax.core.methods import METHODS, Method
+from starjax.data import normalizer
 from starjax.policies import policy
 from starjax.runtime import user_code
 from starjax.sim import registries, scene, wrists
@@ -21,14 +22,14 @@ TRAINED = ("action_space", "sees_trocar", "hierarchical")
 def check(name: str, n: int) -> Iterator[Check]:
     """Yields the checks of a method; `n` is not used."""
     fault, row = attempt("record", lambda: METHODS[name])
-    if not fault and not row.has_wrist:
+    if not fault:
         fault, _ = attempt("action space", lambda: rcm.ACTION_SPACES.registry.get(row.action_space))
     if fault:
         yield fault
         return
     yield Check("record", f"{row.label}: {row.action_space}, {_conditioning(row)}")
     yield verdict("weights", _weights(name, row), f"those of {row.weights_of}")
-    if row.projects and row._replace(projects=False).keeps_to_manifold:
+    if row.projects and normalizer.keeps_to_manifold(row._replace(projects=False)):
         yield Check("projects", f"{row.action_space} is on the manifold without it", NOTE)
     for task in TASKS:
         fault, size = attempt(f"policy in {task}", lambda t=task: _size(name, row, t))
@@ -60,7 +61,7 @@ def _size(name: str, row: Method, task: str) -> int:
 
     def make() -> int:
         found = registries.tasks.get(task)
-        if row.has_wrist:
+        if normalizer.has_wrist(row):
             held = scene.name(task, tools=[WRISTED])
             found = wrists.holding(found, held)
         made = policy.make(row, small, found)
