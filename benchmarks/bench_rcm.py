@@ -81,7 +81,7 @@ def main() -> None:
 
 
 def one_call(repeats: int) -> dict[str, dict[str, float]]:
-    """CPU ms of one call with one pose: three maps, four ways."""
+    """CPU ms of one call with one pose: five maps, four ways."""
     trocar = jax.tree.map(lambda field: field[:1], rcm.TROCARS)
     pose = sample_poses(trocar, 1)
     where = np.asarray(rcm.trocar_position(trocar, P_WORLD_REF))
@@ -91,10 +91,12 @@ def one_call(repeats: int) -> dict[str, dict[str, float]]:
         "decode_rcm4": (rcm.ACTION_SPACES["rcm4"].decode, (action, trocar, P_WORLD_REF)),
         "project": (rcm.project, (pose, where)),
         "angles_through": (rcm.angles_through, (rcm.LARGE_NEEDLE_DRIVER, pose, where)),
+        "through": (rcm.through, (rcm.LARGE_NEEDLE_DRIVER, pose, where)),
+        "trocar_from_poses": (rcm.trocar_from_poses, (sample_poses(trocar, 20),)),
     }
     rows = {}
     for name, (call, inputs) in maps.items():
-        fixed = (0,) if name == "angles_through" else ()
+        fixed = (0,) if inputs[0] is rcm.LARGE_NEEDLE_DRIVER else ()
         jitted = jax.jit(call, static_argnums=fixed)
         ways = {"called": call, "jitted": jitted, "eager": inspect.unwrap(call)}
         rows[name] = {way: cpu_ms(each, inputs, repeats) for way, each in ways.items()}

@@ -9,10 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import core
+from jax.extend.core import get_opaque_trace_state
 from jax.typing import ArrayLike
 
 MAX_PROGRAMS = 64  # programs of a map, one per combination of shapes and types
 _VALUES = (jax.Array, np.ndarray, np.number, np.bool_, int, float)
+_OUTSIDE = get_opaque_trace_state()  # outside of every program
 _BOUND = 1e30  # bound of finite inputs: their sums and squares do not overflow
 
 Arguments = ParamSpec("Arguments")
@@ -76,7 +78,7 @@ def _are_concrete(values: Any) -> bool:
     leaves = jax.tree.leaves(values)
     if any(isinstance(x, core.Tracer) or not isinstance(x, _VALUES) for x in leaves):
         return False
-    return not isinstance(jnp.zeros(()), core.Tracer)  # a constant is one within a program
+    return get_opaque_trace_state() == _OUTSIDE
 
 
 def _are_numbers(values: Any) -> bool:
