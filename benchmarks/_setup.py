@@ -19,7 +19,7 @@ from starjax.policies import policy as policies
 from starjax.policies.learners.diffusion import DiffusionConfig
 from starjax.sim import registries
 from starjax.training import devices, state, step
-from starjax.training.sharding import StateLayout, StepCarry
+from starjax.training.sharding import Setup, StateLayout, StepCarry
 
 TASK = registries.tasks.get("peg_transfer")
 P_WORLD_REF = np.array([slot.p_world_ref for slot in TASK.slots], np.float32)
@@ -119,7 +119,7 @@ def job(case: Case, on: Sequence[jax.Device] | None = None, seed: int = 0, frame
     mesh = devices.make_mesh(batch, on)
     shapes = jax.eval_shape(lambda x: x, first)
     layout = StateLayout(mesh, policy.cast_params, shapes)
-    setup = step.Setup(policy, optimizer, case.policy, case.train, layout)
+    setup = Setup(policy, optimizer, case.policy, case.train, layout)
     looped = step.runs_in_a_loop(case.policy)
 
     def steps(carry, dataset, count):

@@ -26,8 +26,8 @@ from starjax.cli import presets
 from starjax.data import redraw
 from starjax.sim import env as envs
 from starjax.sim.state import EnvParams, ImageSource
-from starjax.training import devices, state, step, stepper
-from starjax.training.sharding import StateLayout
+from starjax.training import batches, devices, redrawing, state, step
+from starjax.training.sharding import Setup, StateLayout
 
 IMAGES = ("darkness=0.5", "tint=0.4", "smoke=0.5", "blood=0.2", "blur=2", "noise=0.1")
 OTHERS = ("camera=10", "observation_delay=4", "observation_dropout=0.5")
@@ -101,15 +101,20 @@ def make(case: _setup.Case, names: tuple[str, ...], dataset: Any, draw: Any) -> 
     )
     mesh = devices.make_mesh(case.train.batch_size, jax.devices()[:1])
     layout = StateLayout(mesh, policy.cast_params, jax.eval_shape(lambda x: x, first))
-    setup = step.Setup(policy, optimizer, case.policy, case.train, layout)
+    setup = Setup(policy, optimizer, case.policy, case.train, layout)
     draws = draw if "camera=10" in names else None
     frames = np.arange(len(dataset.episode), dtype=np.int32)
-    steps = stepper.resident(setup, dataset, frames, ahead=False, draw_images=draws)
-    carry = steps.begin(devices.replicate(first, mesh))
+    data = batches.on_devices(setup, dataset, frames)
+    displace = redrawing.make(setup, draws, data, ahead=False)
+    begun = devices.replicate(first, mesh)
+    stream = batches.resident(setup, data, jnp.copy(begun.key), 0, displace)
+    program, carry = step.batch_program(setup), layout.to_carry(begun)
 
     def run(count: int) -> None:
         nonlocal carry
-        carry = jax.block_until_ready(steps.run(carry, count))
+        for _ in range(count):
+            carry = program(carry, next(stream))
+        jax.block_until_ready(carry)
 
     return run
 

@@ -164,18 +164,18 @@ def feed_main(out: str) -> None:
     from starjax.runtime import processes
 
     processes.join()  # before the modules that make a mesh
-    import test_prefetch
+    import test_batches
 
-    from starjax.training import devices, prefetch
+    from starjax.training import batches, devices
     from starjax.training.sharding import StateLayout
 
     mesh = devices.make_mesh(16)
-    layout = StateLayout(mesh, lambda params: params, test_prefetch.NOTHING)
-    setup = test_prefetch.SETUP._replace(layout=layout)
+    layout = StateLayout(mesh, lambda params: params, test_batches.NOTHING)
+    setup = test_batches.SETUP._replace(layout=layout)
     dataset = jax.tree.map(np.asarray, fakes.dataset(seed=0, demos=2, length=20))
-    gathered, gather = [], prefetch.windows.gather
-    prefetch.windows.gather = lambda d, f, *a: gathered.append(len(f)) or gather(d, f, *a)
-    stream = prefetch.batches(setup, dataset, np.arange(40), jax.random.key(3), 0)
+    gathered, gather = [], batches.windows.gather
+    batches.windows.gather = lambda d, f, *a: gathered.append(len(f)) or gather(d, f, *a)
+    stream = batches.gathered(setup, dataset, np.arange(40), jax.random.key(3), 0)
     found = next(stream).observation.pose.p
     stream.close()
     parts = sorted(found.addressable_shards, key=lambda shard: shard.index[0].start)

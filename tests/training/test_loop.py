@@ -23,7 +23,7 @@ from starjax.core.methods import METHODS
 from starjax.data import windows
 from starjax.policies.models.kernels import packed_params
 from starjax.runtime import files, precompile, signals
-from starjax.training import checkpoint, log, loop, state, step, stepper
+from starjax.training import batches, checkpoint, log, loop, start, state, step
 
 sys.path.insert(0, str(Path(__file__).parent))
 import jobs  # it lies beside this file, for processes to run
@@ -102,11 +102,9 @@ def quick(monkeypatch):
 
 
 def test_demonstrations_kept_out_are_neither_trained_on_nor_fitted(quick, monkeypatch, tmp_path):
-    fitted, drawn, fit, resident = [], [], loop.normalizer.fit, stepper.resident
+    fitted, drawn, fit, place = [], [], loop.normalizer.fit, batches.on_devices
     monkeypatch.setattr(loop.normalizer, "fit", lambda *a: fitted.append(a[3]) or fit(*a))
-    monkeypatch.setattr(
-        stepper, "resident", lambda *a, **k: drawn.append(a[2]) or resident(*a, **k)
-    )
+    monkeypatch.setattr(batches, "on_devices", lambda *a, **k: drawn.append(a[2]) or place(*a, **k))
     jobs.train(tmp_path, dataclasses.replace(jobs.SETTINGS, steps=1))
     dataset = fakes.dataset(seed=0)
     train, held = windows.split_holdout(
@@ -200,7 +198,7 @@ def test_a_stop_right_after_a_checkpoint_does_not_write_it_again(monkeypatch, tm
 
 def test_a_finished_run_is_only_loaded(whole, monkeypatch):
     directory, result = whole
-    monkeypatch.setattr(stepper, "_program", lambda *_: precompile.Program(pytest.fail))
+    monkeypatch.setattr(step, "_program", lambda *_: precompile.Program(pytest.fail))
     before = (directory / "metrics.jsonl").read_bytes()
     again = jobs.train(directory)
     assert_same_bytes(again.state, result.state)
@@ -354,5 +352,5 @@ def test_throughput_is_without_the_call_that_compiles():
 
 
 def test_a_millimetre_is_another_dataset_and_a_last_bit_is_not():
-    assert loop._alike(np.float32([0.05, 3.0]), np.float32([0.05 + 1e-8, 3.0 + 5e-7]))
-    assert not loop._alike(np.float32([0.05, 3.0]), np.float32([0.051, 3.0]))
+    assert start._alike(np.float32([0.05, 3.0]), np.float32([0.05 + 1e-8, 3.0 + 5e-7]))
+    assert not start._alike(np.float32([0.05, 3.0]), np.float32([0.051, 3.0]))

@@ -13,7 +13,7 @@ import pytest
 from starjax.core.methods import METHODS
 from starjax.data import windows
 from starjax.policies import features
-from starjax.training import loop, precompile, stepper
+from starjax.training import loop, precompile, start, step
 
 sys.path.insert(0, str(Path(__file__).parent))
 import jobs  # it lies beside this file, for processes to run
@@ -51,7 +51,7 @@ def test_a_training_takes_the_step_that_is_ready(tmp_path, monkeypatch):
 
     usual = train("usual")
     program = precompile.step_program(*given, ())
-    monkeypatch.setattr(stepper, "batch_program", None)
+    monkeypatch.setattr(step, "batch_program", None)
     monkeypatch.setattr(program, "_function", None)
     found = train("ahead", step_program=program)
     for one, other in zip(jax.tree.leaves(found.params), jax.tree.leaves(usual.params)):
@@ -68,7 +68,7 @@ def test_shapes_of_a_dataset_are_those_of_the_loaded_one(settings):
     if settings is FROZEN:
         found = jnp.zeros((10, settings.vision_dim))
         dataset = dataset.replace(observation=dataset.observation._replace(features=found))
-    dataset = loop._observed(dataset, settings, seen)
+    dataset = start.observed(dataset, settings, seen)
     shapes = precompile.dataset_shapes(settings, 2, 10, seen)
     bare = [jax.tree.map(lambda x: (x.shape, x.dtype), tree) for tree in (shapes, dataset)]
     assert bare[0] == bare[1]
@@ -91,7 +91,7 @@ def test_steps_in_a_loop_are_ready_before_the_data_are_known(tmp_path, monkeypat
         return whole.replace(observation=observation, command=command, episode=episode)
 
     program = precompile.step_program(*given, len(whole.start), room)
-    monkeypatch.setattr(stepper, "loop_program", None)
+    monkeypatch.setattr(step, "loop_program", None)
     monkeypatch.setattr(program, "_function", None)
     monkeypatch.setattr(fakes, "dataset", padded)
     found = jobs.train(tmp_path / "ahead", step_program=program).state

@@ -21,11 +21,11 @@ from starjax.core import config
 from starjax.data import store
 from starjax.evaluation import result
 from starjax.runtime import processes
-from starjax.training import checkpoint, log, loop, prefetch
+from starjax.training import batches, checkpoint, log, loop
 
 sys.path.insert(0, str(Path(__file__).parent))
 import jobs  # it lies beside this file, for processes to run
-import test_prefetch
+import test_batches
 
 
 def start_two(*words: str) -> list[subprocess.Popen]:
@@ -65,7 +65,7 @@ def test_a_process_reads_its_share_of_a_streamed_batch(tmp_path):
     assert [int(one["gathered"]) for one in own] == [8, 8]
     np.testing.assert_array_equal(np.concatenate([one["rows"] for one in own]), np.arange(16))
     dataset = jax.tree.map(np.asarray, fakes.dataset(seed=0, demos=2, length=20))
-    stream = prefetch.batches(test_prefetch.SETUP, dataset, np.arange(40), jax.random.key(3), 0)
+    stream = batches.gathered(test_batches.SETUP, dataset, np.arange(40), jax.random.key(3), 0)
     alone = np.asarray(next(stream).observation.pose.p)
     stream.close()
     # The demonstrations of the two processes differ in last bits.

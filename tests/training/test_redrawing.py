@@ -21,8 +21,8 @@ from starjax.evaluation.disturbances import base
 from starjax.policies.base import Policy
 from starjax.sim.render import CameraImage
 from starjax.sim.state import ImageSource
-from starjax.training import devices, loop, prefetch, randomise, redrawing, state, step, stepper
-from starjax.training.sharding import StateLayout
+from starjax.training import batches, devices, loop, randomise, redrawing, state
+from starjax.training.sharding import Setup, StateLayout
 
 NOTHING: Any = None
 KEY, SIZE, BATCH, MOVED = jax.random.key(4), 4, 16, 4
@@ -37,10 +37,10 @@ def draw(source):
     return {"camera": CameraImage(image)}
 
 
-def make_setup(*names) -> step.Setup:
+def make_setup(*names) -> Setup:
     settings = config.TrainConfig(batch_size=BATCH, randomise=names)
     layout = StateLayout(devices.make_mesh(BATCH), lambda params: params, NOTHING)
-    return step.Setup(NOTHING, NOTHING, POLICY, settings, layout)
+    return Setup(NOTHING, NOTHING, POLICY, settings, layout)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def resident(dataset):
     """Returns a setup, its data, and the functions of its batches and displaced images."""
     setup = make_setup(*NAMES)
     data = (dataset, jnp.arange(40), jnp.int32(40))
-    gather = jax.jit(lambda *given: step.drawn_batch(setup, KEY, *given))
+    gather = jax.jit(lambda *given: batches.drawn_batch(setup, KEY, *given))
     return setup, data, gather, redrawing.make(setup, draw, data, ahead=False)
 
 
@@ -71,7 +71,7 @@ def displaced_rows(setup) -> np.ndarray:
 
 
 def choice(setup, data, number) -> Any:
-    return step.choose(setup, KEY, jnp.int32(number), *data)
+    return batches.choose(setup, KEY, jnp.int32(number), *data)
 
 
 def test_a_displaced_camera_is_that_of_a_stressed_episode_with_the_same_key(dataset, resident):
@@ -131,19 +131,19 @@ def test_images_depend_on_the_step_alone(resident, monkeypatch):
 def test_streamed_batches_are_the_resident_ones(dataset, resident):
     setup, data, gather, displaced = resident
     on_host = jax.tree.map(np.asarray, dataset)
-    stream = prefetch.batches(setup, on_host, np.arange(40), KEY, 2)
+    stream = batches.gathered(setup, on_host, np.arange(40), KEY, 2)
     places = (windows.places(dataset), *data[1:])
     for number in (2, 3):
         images = displaced(KEY, number)
         wanted = gather(jnp.int32(number), *data, images)
-        found = stepper._disturbed(setup, KEY, jnp.int32(number), next(stream), images, *places)
+        found = batches._disturbed(setup, KEY, jnp.int32(number), next(stream), images, *places)
         jax.tree.map(np.testing.assert_array_equal, found, wanted)
     stream.close()
 
 
 def test_without_names_a_batch_is_what_it_was(dataset):
     data = (dataset, jnp.arange(40), jnp.int32(40))
-    batch = step.drawn_batch(make_setup(), KEY, jnp.int32(5), *data)
+    batch = batches.drawn_batch(make_setup(), KEY, jnp.int32(5), *data)
     frame = windows.sample_frames(state.step_keys(KEY, jnp.int32(5)).batch, data[1], BATCH)
     jax.tree.map(np.testing.assert_array_equal, batch, windows.gather(dataset, frame, 2, 16))
 
@@ -198,7 +198,7 @@ def test_a_resumed_training_meets_the_same_images(dataset, monkeypatch, tmp_path
 def test_a_dataset_of_others_has_its_images_disturbed(dataset):
     setup = make_setup("smoke=0.5", "observation_delay=4")
     data = (dataset.replace(sources=None), jnp.arange(40), jnp.int32(40))
-    batch, chosen = step.drawn_batch(setup, KEY, jnp.int32(5), *data), choice(setup, data, 5)
+    batch, chosen = batches.drawn_batch(setup, KEY, jnp.int32(5), *data), choice(setup, data, 5)
     plain = windows.gather(dataset, chosen.frame, 2, POLICY.horizon, chosen.seen)
     images, usual = ((it.observation.images or {})["camera"] for it in (batch, plain))
     clouded = np.asarray(images != usual).any(axis=(1, 2, 3, 4))
@@ -211,7 +211,7 @@ def test_a_dataset_of_others_has_no_displaced_cameras(dataset):
     for given, function in ((dataset, None), (dataset.replace(sources=None), draw)):
         data = (given, frames, np.int32(40))
         with mistakes.of("train.randomise"):
-            stepper._displaced(setup, data, False, function)
+            redrawing.make(setup, function, data, False)
     both = config.TrainConfig(randomise=(*NAMES, "look=1"))
     assert randomise.redraws(both) and randomise.redrawn_names(both) == ["camera", "look"]
     assert not randomise.redraws(config.TrainConfig(randomise=NAMES[1:]))

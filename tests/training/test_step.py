@@ -18,8 +18,7 @@ from starjax.policies import policy as policies
 from starjax.policies.base import Policy
 from starjax.runtime import xla
 from starjax.training import devices, state, step
-from starjax.training.sharding import StateLayout
-from starjax.training.step import Setup
+from starjax.training.sharding import Setup, StateLayout
 
 STRICT = {
     "promotion of types": lambda: jax.numpy_dtype_promotion("strict"),

@@ -32,21 +32,22 @@ def make(
         return {"unet": unet.init(key, jnp.zeros((1, *shape)), jnp.zeros(1, jnp.int32), condition)}
 
     def loss(params: Params, condition: Condition, given: Any) -> tuple[jax.Array, dict]:
-        joined = sequences.condition_vector(condition)
+        joined = sequences.condition_vector(condition)  # c, [B, C]
 
         def predict(x: jax.Array, time: jax.Array, rows: Any = slice(None)) -> jax.Array:
             return apply(params["unet"], x, time, joined[rows])
 
-        return process.loss(predict, given), {}
+        return process.loss(predict, given), {}  # Eq. 9 for diffusion
 
     def sample(
         params: Params, keys: jax.Array, condition: Condition, reach: jax.Array | None
     ) -> jax.Array:
+        # Once a decision: FiLM is affine, so the condition's part is the same at every step.
         film = apply(params["unet"], sequences.condition_vector(condition), method="condition")
 
         def predict(x: jax.Array, film_of_time: jax.Array) -> jax.Array:
             """Predicts for `x` `[B, H, D]` at one time, or `[n, B, H, D]` at n times."""
-            rows = (film + film_of_time[..., None, :]).reshape(-1, film.shape[-1])
+            rows = (film + film_of_time[..., None, :]).reshape(-1, film.shape[-1])  # [n * B, F]
             found = apply(params["unet"], x.reshape(-1, *shape), rows, method="denoise")
             return found.reshape(x.shape)
 

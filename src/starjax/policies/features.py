@@ -59,11 +59,13 @@ def per_step(trocar: rcm.TrocarFrame) -> rcm.TrocarFrame:
 
 def trocar_features(trocar: rcm.Trocar) -> jax.Array:
     """Encodes trocars `[...]` as `[..., 7]` numbers of order one, continuous in the azimuth."""
+    # Eq. 2
     shift = rcm.trocar_position(trocar, jnp.zeros(3))  # from the nominal one
     scalars = jnp.stack(
         [
             trocar.radius / _LENGTH,
             jnp.cos(trocar.polar),
+            # phi itself jumps at 2 pi.
             jnp.cos(trocar.azimuth),
             jnp.sin(trocar.azimuth),
         ],
@@ -148,6 +150,7 @@ def training_inputs(
     """
     key_history, key_image = jax.random.split(key)
     history = _history(policy_config, sensors.task, stats, observation, proprioception)
+    # Demonstrated states are exact, measured ones are not.
     noise = jax.random.normal(key_history, history.shape, history.dtype)
     history = history + train_config.state_noise * noise
     if policy_config.observation == "state":

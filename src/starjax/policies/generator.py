@@ -82,7 +82,7 @@ def make(
 
     def init(key: jax.Array) -> Params:
         key_vision, key_state, key_learner = jax.random.split(key, 3)
-        history = jnp.zeros((1, policy_config.obs_horizon, width))
+        history = jnp.zeros((1, policy_config.obs_horizon, width))  # [1, O, S]: shapes alone
         params = {"state": state.init(key_state, history), "learner": model.init(key_learner)}
         if learns_vision:
             for name, (network, _) in readers.items():
@@ -98,15 +98,18 @@ def make(
         batch, moments = images.shape[:2]
         return kernels.applied(network)(
             params[name],
-            images.reshape(-1, *images.shape[3:]),
+            images.reshape(-1, *images.shape[3:]),  # [B * O * K, c, c, 3]: one encoder for all
             None if offset is None else offset.reshape(-1, 2),
         ).reshape(batch, moments, -1)
 
     def observe(params: Params, inputs: features.Inputs, trocar_condition: jax.Array) -> Condition:
         visual = inputs.features
         if visual is None and inputs.images is not None:
+            # Colours and depth may have encoders of their own; features are joined in their
+            # order.
             parts = [read(params, name, inputs.images, inputs.offset) for name in readers]
             visual = parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=-1)
+        # c = [v, s] (Eq. 10, 11); the trocar's part is empty in the paper's method.
         return Condition(visual, of_state(params["state"], inputs.history), trocar_condition)
 
     def cast_params(params: Params) -> Params:
@@ -139,6 +142,7 @@ def _readers(
       errors.UsageError: an encoder of depth would read colours.
     """
     is_depth = [names.is_depth(camera) for camera in sensors.cameras]
+    # Without an encoder of its own a view of depth is read as a grey image.
     split = bool(policy_config.depth_encoder) and any(is_depth)
     cameras = {
         "vision": [i for i, depth in enumerate(is_depth) if not (split and depth)],

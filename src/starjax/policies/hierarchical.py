@@ -87,11 +87,12 @@ def make(
             generated(measured),
         )
         wanted = by_arm(action)
+        # [B, H, A, 3], [B, O, A, N]
         p, history = wanted[..., position], by_arm(measured)[..., turns]
         return PreparedHierarchy(
             inputs=inputs,
             trocar_condition=features.trocar_condition(method, batch.trocar),
-            model_inputs=model.prepare(key_model, generated(action)),
+            model_inputs=model.prepare(key_model, generated(action)),  # a_0 = [p_abs, g], no roll
             p=p + POSITION_NOISE * jax.random.normal(key_p, p.shape),
             trocar=features.trocar_features(batch.trocar.trocar),
             history=history + ROLL_NOISE * jax.random.normal(key_roll, history.shape),
@@ -102,9 +103,12 @@ def make(
         """Returns position loss + lambda * roll loss (Eq. 15)."""
         condition = networks.observe(params, prepared.inputs, prepared.trocar_condition)
         position_loss, metrics = model.loss(params["learner"], condition, prepared.model_inputs)
-        path = prepared.p, prepared.trocar, prepared.history
+        path = prepared.p, prepared.trocar, prepared.history  # x_rel (Eq. 13)
         predicted = rolls.along(params["roll"], *path, condition)
+        # The roll's loss reads demonstrated positions: none of its gradient reaches the position
+        # model, which therefore cannot learn the trocar.
         roll_loss = jnp.mean((prepared.roll - predicted) ** 2)  # Eq. 14
+        # L = L_abs + lambda L_rel
         total = position_loss + policy_config.roll_loss_weight * roll_loss
         return total, {"position_loss": position_loss, "roll_loss": roll_loss, **metrics}
 
@@ -114,7 +118,7 @@ def make(
         # 2. turns along the sampled path (Eq. 13), clipped to the demonstrated range
         about = features.trocar_features(trocar.trocar)
         gamma = rolls.along(params["roll"], p, about, by_arm(measured)[..., turns], condition)
-        gamma = jnp.clip(gamma, -1.0, 1.0)
+        gamma = jnp.clip(gamma, -1.0, 1.0)  # an MLP extrapolates
         # 3. action vector in the order of the space, decoded on the RCM manifold (Alg. 1)
         action = jnp.concatenate([gamma, p, gripper], axis=-1)
         action = action.reshape(*x0.shape[:-1], -1)

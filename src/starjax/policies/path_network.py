@@ -68,14 +68,16 @@ def make(
         batch, horizon = path.shape[:2]
         more = None
         if policy_config.roll_observation:
-            more = jnp.repeat(sequences.observation_vector(condition), arms, axis=0)
+            more = jnp.repeat(sequences.observation_vector(condition), arms, axis=0)  # [B * A, C]
         found = predict(
             params,
+            # Arms become rows of the batch: one f_phi serves all, as it does not know which arm
+            # it turns.
             path.swapaxes(1, 2).reshape(batch * arms, horizon, -1),
-            trocar_weight * trocar.reshape(batch * arms, -1),
+            trocar_weight * trocar.reshape(batch * arms, -1),  # 0 hides an input, at equal sizes
             history_weight * history.swapaxes(1, 2).reshape(batch * arms, -1),
             more,
         )
-        return found.reshape(batch, arms, horizon, outputs).swapaxes(1, 2)
+        return found.reshape(batch, arms, horizon, outputs).swapaxes(1, 2)  # [B, H, A, N]
 
     return PathNetwork(init, along)

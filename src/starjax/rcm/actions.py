@@ -78,28 +78,31 @@ def _decode_se3(parts: dict[str, jax.Array], frame: "SpaceFrame") -> types.Pose:
 
 def _encode_rcm1(pose: types.Pose, frame: "SpaceFrame") -> list[jax.Array]:
     depth = manifold.insertion_depth(pose, frame.p)
-    R_trocar_tip = arrays.matmul(frame.R.mT, pose.R)
-    return [depth[..., None], rotations.rot6d_encode(R_trocar_tip)]
+    R_trocar_tip = arrays.matmul(frame.R.mT, pose.R)  # R' of a rotation is its inverse
+    return [depth[..., None], rotations.rot6d_encode(R_trocar_tip)]  # (d_rel, R_rel)
 
 
 def _decode_rcm1(parts: dict[str, jax.Array], frame: "SpaceFrame") -> types.Pose:
+    # R_world_tip = R_world_trocar R_trocar_tip
     R = arrays.matmul(frame.R, rotations.rot6d_decode(parts["R"]))
     return manifold.pose_at_depth(R, parts["depth"][..., 0], frame.p)
 
 
 def _encode_rcm2(pose: types.Pose, frame: "SpaceFrame") -> list[jax.Array]:
     p_trocar_tip = arrays.matvec(frame.R.mT, pose.p - frame.p)
-    return [roll_from_zero(pose.R, frame), p_trocar_tip]
+    return [roll_from_zero(pose.R, frame), p_trocar_tip]  # (gamma_rel, p_rel)
 
 
 def _decode_rcm2(parts: dict[str, jax.Array], frame: "SpaceFrame") -> types.Pose:
-    offset_world = arrays.matvec(frame.R, parts["p"])
+    offset_world = arrays.matvec(frame.R, parts["p"])  # p_tip - p_trocar
+    # Relative: the trocar is the origin, so nearness to it keeps its digits.
     axis, depth = manifold.axis_and_depth(offset_world, jnp.zeros_like(offset_world))
     return manifold.pose_on_manifold(axis, parts["roll"][..., 0] + frame.roll_zero, depth, frame.p)
 
 
 def _encode_rcm3(pose: types.Pose, frame: "SpaceFrame") -> list[jax.Array]:
     depth = manifold.insertion_depth(pose, frame.p)
+    # (d_rel, R_abs): the rotation is the world's, the depth is counted from this trocar.
     return [depth[..., None], rotations.rot6d_encode(pose.R)]
 
 
@@ -109,19 +112,19 @@ def _decode_rcm3(parts: dict[str, jax.Array], frame: "SpaceFrame") -> types.Pose
 
 
 def _encode_rcm4(pose: types.Pose, frame: "SpaceFrame") -> list[jax.Array]:
-    return [roll_from_zero(pose.R, frame), pose.p]
+    return [roll_from_zero(pose.R, frame), pose.p]  # (gamma_rel, p_abs): p does not know the trocar
 
 
 def _decode_rcm4(parts: dict[str, jax.Array], frame: "SpaceFrame") -> types.Pose:
     """Applies Algorithm 1, with the alignment in the z-down frame (`rotation_from_axis_roll`)."""
-    axis, depth = manifold.axis_and_depth(parts["p"], frame.p)
+    axis, depth = manifold.axis_and_depth(parts["p"], frame.p)  # v and d (Alg. 1, line 2; Eq. 18)
     return manifold.pose_on_manifold(axis, parts["roll"][..., 0] + frame.roll_zero, depth, frame.p)
 
 
 def roll_from_zero(R: jax.Array, frame: "SpaceFrame") -> jax.Array:
     """Returns the roll `[..., 1]` from the frame's zero, within half a turn either way."""
     roll = rotations.roll_of(R) - frame.roll_zero
-    return (roll - 2.0 * jnp.pi * jnp.round(roll / (2.0 * jnp.pi)))[..., None]
+    return (roll - 2.0 * jnp.pi * jnp.round(roll / (2.0 * jnp.pi)))[..., None]  # to [-pi, pi]
 
 
 class SpaceFrame(NamedTuple):
@@ -197,11 +200,13 @@ def make_space(
         if turned:
             R_world_trocar, roll_zero = turned
             valid &= jnp.isfinite(R_world_trocar).all(axis=(-2, -1)) & jnp.isfinite(roll_zero)
+        # Finite numbers in place of NaN: their results are dropped below, but must not poison
+        # gradients.
         frame, _ = _frame([arrays.bounded(value) for value in rest])
         bounded = arrays.bounded(action)
         pose = decode({part: bounded[..., where] for part, where in slices.items()}, frame)
         hold = _hold_pose(frame.p)
-        R = jnp.where(valid[..., None, None], pose.R, hold.R)
+        R = jnp.where(valid[..., None, None], pose.R, hold.R)  # the robot always gets a pose
         p = jnp.where(valid[..., None], pose.p, hold.p)
         return types.Pose(R=R, p=p), valid
 

@@ -27,6 +27,7 @@ def rcm_error(pose: types.Pose, p_world_trocar: ArrayLike) -> jax.Array:
       `[...]` m; its derivative on the line, a kink, is zero.
     """
     R, p, p_world_trocar = _checked(pose, p_world_trocar)
+    # |(p_E - p_T) x R e_z|: Eq. 3 holds where the cross product is zero.
     return arrays.norm(jnp.cross(p - p_world_trocar, R[..., :, 2]))
 
 
@@ -34,7 +35,7 @@ def rcm_error(pose: types.Pose, p_world_trocar: ArrayLike) -> jax.Array:
 def insertion_depth(pose: types.Pose, p_world_trocar: ArrayLike) -> jax.Array:
     """Returns the signed depth d `[...]` m of the tip beyond the trocar along the axis (Eq. 3)."""
     R, p, p_world_trocar = _checked(pose, p_world_trocar)
-    return arrays.dot(p - p_world_trocar, R[..., :, 2])[..., 0]
+    return arrays.dot(p - p_world_trocar, R[..., :, 2])[..., 0]  # d = (p_E - p_T) . R e_z
 
 
 @arrays.compiled()
@@ -73,8 +74,9 @@ def pose_at_depth(
     R, depth, p_world_trocar = arrays.checked(
         R_world_tip=(R_world_tip, (3, 3)), depth=(depth, ()), p_world_trocar=(p_world_trocar, (3,))
     )
+    # At depth 0 the direction is undefined, and joints would turn infinitely fast.
     depth = jnp.clip(depth, MIN_DEPTH, MAX_DEPTH)[..., None]
-    p = p_world_trocar + depth * R[..., :, 2]
+    p = p_world_trocar + depth * R[..., :, 2]  # Eq. 3
     return types.Pose(R=jnp.broadcast_to(R, (*p.shape, 3)), p=p)
 
 
@@ -109,10 +111,13 @@ def project(pose: types.Pose, p_world_trocar: ArrayLike) -> types.Pose:
     """
     given = _checked(pose, p_world_trocar)
     R, p, p_world_trocar = given
+    # Zero, or NaN where an entry is not finite: added at the end, after safe arithmetic.
     unknown = arrays.taint(R.reshape(*R.shape[:-2], 9)) + arrays.taint(p)
     unknown = unknown + arrays.taint(p_world_trocar)
     R, p, p_world_trocar = (arrays.bounded(x) for x in given)
+    # a tip at the trocar keeps its axis
     target, _ = arrays.direction(p - p_world_trocar, R[..., :, 2])
+    # smallest turn about the tip
     R = arrays.matmul(rotations.rotation_align(R[..., :, 2], target), R)
     is_known = jnp.isfinite(unknown)
     return types.Pose(

@@ -44,10 +44,10 @@ def rotation_align(a: ArrayLike, b: ArrayLike) -> jax.Array:
 
 
 def _align_unit(a: jax.Array, b: jax.Array) -> jax.Array:
-    cos = arrays.dot(a, b)
+    cos = arrays.dot(a, b)  # a . b, [.., 1]
     across = b - cos * a  # sin(angle) times a unit vector orthogonal to a
     in_plane, sin = arrays.direction(across, _orthogonal(a))
-    in_plane = in_plane - arrays.dot(in_plane, a) * a
+    in_plane = in_plane - arrays.dot(in_plane, a) * a  # again: near b = -a rounding dominates
     in_plane, _ = arrays.direction(in_plane, _orthogonal(a))
     # Rodrigues in the plane (a, b): R = I + (w a' - a w') - (1 - cos)(a a' + e e'), with e the unit
     # vector across a and w = sin e. Acute: (1 - cos) e e' = w w' / (1 + cos), the factor of
@@ -56,6 +56,7 @@ def _align_unit(a: jax.Array, b: jax.Array) -> jax.Array:
     w = jnp.where(is_obtuse, sin[..., None] * in_plane, across)
     spanning = jnp.where(is_obtuse, in_plane, across)
     factor = jnp.where(is_obtuse, 1.0 - cos, 1.0 / (1.0 + jnp.where(is_obtuse, 0.0, cos)))
+    # Eq. 16 with k = a x b: [k]x = w a' - a w', [k]x^2 = -(1 - cos^2)(a a' + e e').
     eye = jnp.eye(3, dtype=a.dtype)
     turn = _outer(w, a) - _outer(a, w)
     return eye + turn - _outer((1.0 - cos) * a, a) - _outer(factor * spanning, spanning)
@@ -98,7 +99,7 @@ def rotation_from_axis_roll(axis_world: ArrayLike, roll: ArrayLike) -> jax.Array
     base = _base_rotation(axis_world)
     cos, sin = (value[..., None] for value in cos_sin(roll))
     x, y, z = base[..., :, 0], base[..., :, 1], base[..., :, 2]
-    x, y, z = jnp.broadcast_arrays(cos * x + sin * y, cos * y - sin * x, z)
+    x, y, z = jnp.broadcast_arrays(cos * x + sin * y, cos * y - sin * x, z)  # R_base R_z(gamma)
     return jnp.stack([x, y, z], axis=-1)
 
 
@@ -115,6 +116,7 @@ def roll_of(R_world_tip: ArrayLike) -> jax.Array:
     (R_world_tip,) = arrays.checked(R_world_tip=(R_world_tip, (3, 3)))
     base = _base_rotation(R_world_tip[..., :, 2])
     x = jnp.clip(R_world_tip[..., :, 0], -_MOST_ENTRY, _MOST_ENTRY)
+    # R_base' R = R_z(gamma): read off its first column
     cos = arrays.dot(base[..., :, 0], x)[..., 0]
     sin = arrays.dot(base[..., :, 1], x)[..., 0]
     # Invalid rotations can give (0, 0), where arctan2 has no derivative.
@@ -153,14 +155,14 @@ def rot6d_decode(rot6d: ArrayLike) -> jax.Array:
     # Twice, because the remainder of nearly parallel columns is small and loses orthogonality.
     for _ in range(2):
         y, _ = arrays.direction(y - arrays.dot(x, y) * x, spare)
-    return jnp.stack([x, y, jnp.cross(x, y)], axis=-1)
+    return jnp.stack([x, y, jnp.cross(x, y)], axis=-1)  # right-handed by construction
 
 
 def _base_rotation(axis_world: jax.Array) -> jax.Array:
     """Computes `G @ rotation_align(e_z, G' @ axis_world)`, written out, of `[..., 3]`."""
     axis, _ = arrays.direction(arrays.bounded(axis_world * _DOWN.astype(axis_world.dtype)), _E_Z)
     across, z = axis[..., :2], axis[..., 2]
-    unit, sin = arrays.direction(across, _E_Y[:2])
+    unit, sin = arrays.direction(across, _E_Y[:2])  # straight up: half a turn about a fixed axis
     is_obtuse = z < 0.0
     spanning = jnp.where(is_obtuse[..., None], unit, across)
     factor = jnp.where(is_obtuse, 1.0 - z, 1.0 / (1.0 + jnp.where(is_obtuse, 0.0, z)))

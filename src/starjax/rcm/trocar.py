@@ -95,7 +95,7 @@ def trocar_position(trocar: Trocar, p_world_ref: ArrayLike) -> jax.Array:
     radius, polar, azimuth, p_world_ref = arrays.checked(
         **named_fields(trocar), p_world_ref=(p_world_ref, (3,))
     )
-    cos_polar, sin_polar = rotations.cos_sin(polar)
+    cos_polar, sin_polar = rotations.cos_sin(polar)  # reduced first: float32 loses huge angles
     cos_azimuth, sin_azimuth = rotations.cos_sin(azimuth)
     offset = jnp.stack(
         jnp.broadcast_arrays(
@@ -128,10 +128,11 @@ def trocar_from_position(p_world_trocar: ArrayLike, p_world_ref: ArrayLike) -> T
     offset = p_world_trocar - p_world_ref
     unknown = arrays.taint(offset)
     offset = jnp.where(jnp.isfinite(unknown), offset, unknown)
-    radius, across = arrays.norm(offset), arrays.norm(offset[..., :2])
+    radius, across = arrays.norm(offset), arrays.norm(offset[..., :2])  # r, r sin(theta)
     x, y, z = (offset[..., i] for i in range(3))
     # Here arctan2 has no derivative or an unbounded one.
     is_ref, is_above = (length <= arrays.epsilon(offset.dtype) for length in (radius, across))
+    # arctan2 keeps its digits at the poles, where arccos(z / r) has none.
     polar = jnp.arctan2(jnp.where(is_ref, 1.0, across), z)
     azimuth = jnp.arctan2(jnp.where(is_above, 0.0, y), jnp.where(is_above, 1.0, x))
     return Trocar(radius, polar, jnp.where(azimuth < 0.0, azimuth + 2.0 * np.pi, azimuth))
@@ -144,6 +145,8 @@ def trocar_rotation(trocar: Trocar) -> jax.Array:
     azimuth = jnp.broadcast_arrays(*fields)[2]
     cos, sin = rotations.cos_sin(azimuth)
     zero = jnp.zeros_like(cos)
+    # Columns x, y, z of {T}: gravity-aligned, as the paper's, and turned about it by the azimuth
+    # phi.
     rows = ([cos, sin, zero], [sin, -cos, zero], [zero, zero, zero - 1.0])
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 

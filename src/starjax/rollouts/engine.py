@@ -79,6 +79,7 @@ def make(
     given = {name: np.float32(level) for name, level in (levels or {}).items()}
 
     def run(params: Any, group: Sequence[episodes.Trial]) -> Generator[Progress]:
+        # Idle lanes fill the batch: one program, and one rounding, for any number of trials.
         carry = start(key, params, _filled(trocars, group, settings.lanes), given)
         running = list(range(len(group)))
         images: dict[int, dict[str, list[np.ndarray]]] = {lane: {} for lane in running}
@@ -86,6 +87,7 @@ def make(
         # In a thread: on a GPU a call may hold its caller while its loops check their conditions
         # on the host.
         with ThreadPoolExecutor(1) as device:
+            # Segment n + 1 runs while the host fetches segment n.
             ahead = device.submit(advance, params, carry, np.int32(0))
             del carry
             for last in range(record.frames, settings.max_steps + record.frames, record.frames):
@@ -99,13 +101,14 @@ def make(
                     # Before anything is waited for. If all are over, it ends at once, unused.
                     ahead = device.submit(advance, params, carry, np.int32(last))
                 del carry
-                status = jax.device_get(status)
+                status = jax.device_get(status)  # waits for the segment
                 others.append(jax.device_get(records))
                 for name, parts in drawn.items():
                     for lane, fetched in zip(running, fetching.fetch(parts), strict=True):
                         images[lane].setdefault(name, []).append(fetched)
-                is_last = last >= settings.max_steps
+                is_last = last >= settings.max_steps  # time is over for all
                 over = [lane for lane in running if status["over"][lane] or is_last]
+                # Images of finished lanes are no longer fetched: they are most of the bytes.
                 running = [lane for lane in running if lane not in over]
                 yield Progress(
                     1.0 if not running else last / settings.max_steps,
@@ -154,5 +157,5 @@ def _key(settings: RolloutSettings) -> jax.Array:
 def _filled(trocars: Trocar, group: Sequence[episodes.Trial], lanes: int) -> programs.Trials:
     """Returns a full batch; repetitions of the first trial, inactive, fill it."""
     index, trial = np.array([*group, *[group[0]] * (lanes - len(group))], np.int32).T
-    active = np.arange(lanes) < len(group)
+    active = np.arange(lanes) < len(group)  # idle lanes count as over
     return programs.Trials(Trocar(*(field[index] for field in trocars)), index, trial, active)

@@ -21,21 +21,26 @@ def chain_of(m: mujoco.MjModel, first: str, site: str, joints: tuple[str, ...] =
         on the way is neither hinge nor slide, or another than expected.
     """
     path = _path(m, first, site)
-    data = mujoco.MjData(m)
+    data = mujoco.MjData(m)  # the base's pose in the zero configuration
     mujoco.mj_kinematics(m, data)
     root = int(m.body_parentid[path[0]])
     on_way = [j for body in path for j in _joints(m, body)]
     _check(m, first, on_way, joints)
+    # Fixed bodies fold into the transform to the next joint.
     p, R = np.zeros(3), np.eye(3)  # from the last joint on
     offsets, rotations = [], []
     for body in path:
         p, R = p + R @ m.body_pos[body], R @ _matrix(m.body_quat[body])
         for j in _joints(m, body):
+            # qpos0: angle of the drawn pose
             to_axis, zero = _from_z(m.jnt_axis[j]), -m.qpos0[m.jnt_qposadr[j]]
             is_hinge = m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE
+            # A hinge turns about its anchor; a slide has none, and starts at -qpos0 along its
+            # axis.
             anchor = m.jnt_pos[j] if is_hinge else zero * m.jnt_axis[j]
             offsets.append(p + R @ anchor)
             rotations.append(R @ to_axis @ _about_z(zero) if is_hinge else R @ to_axis)
+            # back to the body's frame
             p, R = (-to_axis.T @ anchor if is_hinge else np.zeros(3)), to_axis.T
     return Chain(
         p_base=_float32(data.xpos[root]),

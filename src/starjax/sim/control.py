@@ -56,24 +56,29 @@ def toward(
     Returns:
       the next reference pose, equal to `target` if that is near enough; its velocity `[7]`.
     """
+    # 1. The tip, on a straight line; 2. the axis's point at the trocar, by the same fraction; 3.
+    # the roll.
     step, fraction = step_tip(present.p, target.p, velocity[:3], period)
     p = present.p + step
 
     z_present, z_target = present.R[:, 2], target.R[:, 2]
     here, there = nearest(present, p_trocar), nearest(target, p_trocar)
     shift, through, is_slowed = step_point(here, there, fraction, velocity[4:VELOCITY], period)
-    axis = p - through
+    axis = p - through  # from the trocar's side to the tip
     axis = axis * jnp.where(axis @ z_present < 0, -1.0, 1.0)  # the tip is above the trocar
     axis = jnp.where(jnp.linalg.norm(axis) < NO_DIRECTION, z_present, axis)
     z = axis / jnp.maximum(jnp.linalg.norm(axis), 1e-6)
     # The rest of the rotation, once the axes are aligned, is a roll about the axis.
+    # The smallest rotation between the axes adds no roll: what is left is the twist to make.
     carried = rcm.rotation_align(z_present, z_target) @ present.R
+    # in the plane of both
     twist = jnp.arctan2(carried[:, 1] @ target.R[:, 0], carried[:, 0] @ target.R[:, 0])
     spin = bounded_step(
         twist[None], velocity[3:4] * period, MAX_SPIN * period, MAX_SPIN_ACCELERATION * period**2
     )
     R = rcm.rotation_align(z_present, z) @ present.R @ rcm.rotation_z(spin[0])
 
+    # To the bit: a reference that has arrived is the command itself, without rounding.
     is_there = jnp.all(step == target.p - present.p) & (spin[0] == twist) & ~is_slowed
     pose = jax.tree.map(lambda a, b: jnp.where(is_there, a, b), target, Pose(R, p))
     return pose, jnp.concatenate([step, spin, shift]) / period
@@ -86,7 +91,7 @@ def step_tip(
     step = bounded_step(
         target - p, velocity * period, MAX_SPEED * period, MAX_ACCELERATION * period**2
     )
-    length = jnp.sum((target - p) ** 2)
+    length = jnp.sum((target - p) ** 2)  # its square
     fraction = jnp.sum(step * (target - p)) / jnp.where(length > 0, length, 1.0)
     return step, jnp.where(length > 0, jnp.clip(fraction, 0.0, 1.0), 1.0)
 
@@ -113,12 +118,13 @@ def correct(
     correction: jax.Array, measured: Pose, reference: Pose, p_trocar: jax.Array
 ) -> jax.Array:
     """Integrates the measured deviation into the axis's correction `[3]` m at the trocar."""
-    deviation = nearest(measured, p_trocar) - nearest(reference, p_trocar)
+    deviation = nearest(measured, p_trocar) - nearest(reference, p_trocar)  # m, across the axis
     far = jnp.maximum(jnp.linalg.norm(deviation), MAX_DEVIATION)
-    lever = jnp.abs((reference.p - p_trocar) @ reference.R[:, 2])
+    lever = jnp.abs((reference.p - p_trocar) @ reference.R[:, 2])  # m, tip to trocar along the axis
     gain = HOLD_GAIN * jnp.minimum(1.0, lever / FIRM_DEPTH) ** 2
+    # An integral: a constant load leaves no deviation.
     correction = correction - gain * deviation * (MAX_DEVIATION / far)
-    largest = jnp.minimum(MAX_CORRECTION, MAX_TURN * lever)
+    largest = jnp.minimum(MAX_CORRECTION, MAX_TURN * lever)  # m: small angles near the trocar
     return correction * jnp.minimum(1.0, largest / jnp.maximum(jnp.linalg.norm(correction), 1e-9))
 
 
@@ -128,6 +134,7 @@ def corrected(pose: Pose, p_trocar: jax.Array, correction: jax.Array) -> Pose:
     depth = (pose.p - p_trocar) @ z
     correction = jnp.where(depth < 0, -correction, correction)  # sign for a tip above the trocar
     lever = jnp.maximum(jnp.abs(depth), rcm.MIN_DEPTH)
+    # The tip stays: only the axis moves at the trocar.
     return Pose(rcm.rotation_align(z, lever * z - correction) @ pose.R, pose.p)
 
 
@@ -143,10 +150,12 @@ def bounded_step(
     # Largest first step s that stops within `length` when each next one is `change` shorter:
     # s (s + change) / (2 change) = length.
     can_stop = 0.5 * (jnp.sqrt(change**2 + 8.0 * change * length) - change)
-    target = way * jnp.minimum(1.0, jnp.minimum(largest, can_stop) / length)
+    target = way * jnp.minimum(1.0, jnp.minimum(largest, can_stop) / length)  # never past its end
     bend = target - last
     square = jnp.sum(bend**2)
     size = jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    # A ball of radius `change` about the last step: acceleration is bounded in every direction
+    # alike.
     return jnp.where(size <= change, target, last + bend * (change / size))
 
 

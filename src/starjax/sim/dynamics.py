@@ -27,7 +27,8 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose)
     )
     count = len(scene.arms)
     tips = scene.task.tips(scene.bound, layout, trocar.p_world_trocar)
-    start = jnp.concatenate([jnp.zeros((count, 1)), tips], axis=-1)
+    start = jnp.concatenate([jnp.zeros((count, 1)), tips], axis=-1)  # [A, 4]: roll 0 and the tip
+    # Alg. 1: any tip has a pose on the manifold
     pose, _ = rcm.ACTION_SPACES["rcm4"].decode(start, trocar)
     solved = [
         arm_motion.reach(
@@ -37,6 +38,7 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose)
     ]
     q = tuple(q for q, _ in solved)
     no = jnp.zeros((), bool)
+    # A trocar that is no place ends the episode at once, instead of NaN in its lane.
     is_lost = ~jnp.all(jnp.isfinite(trocar.p_world_trocar))
     state = physics.initial(scene, q, layout, trocar.p_world_trocar)
     # Jaws are open unless the task's objects begin between them.
@@ -90,9 +92,10 @@ def step(
     """Advances one control period towards `command` `[A]`, with the physics `advance`."""
     moved, after, solver_error = attempt(scene, state, command, advance)
     stopped = state.replace(invalid=jnp.ones((), bool), done=jnp.ones((), bool))
+    # The last sound state stays, marked invalid: one diverged lane leaves no NaN in its batch.
     sound = physics.is_sound(scene, after) & (solver_error < max_solver_error(scene))
     moved = _select(sound, moved, stopped)
-    return _select(state.done, state, moved)
+    return _select(state.done, state, moved)  # finished lanes of a batch stand still
 
 
 def max_solver_error(scene: scenes.Scene) -> float:
@@ -128,7 +131,10 @@ def attempt(
     )
     moved = state.replace(
         physics=after,
+        # The reference advances from where it was, not from the measured joints: the servo's lag
+        # would add up.
         q_target=tuple(q + d for q, d in zip(state.q_target, dq, strict=True)),
+        # rad/s at the period's end, see `servo_targets`
         q_velocity=tuple(CONTROL_HZ * d for d in dq),
         velocity=jnp.stack([_padded(v, state.velocity.shape[-1]) for v in velocity]),
         correction=jnp.stack(correction),
@@ -147,7 +153,7 @@ def attempt(
 def with_status(scene: scenes.Scene, state: EnvState) -> EnvState:
     """Returns the measured state with its outcome."""
     status = scene.task.status(scene.bound, state.layout, state.measurements)
-    settled = jnp.where(status.success_now, state.settled + 1, 0)
+    settled = jnp.where(status.success_now, state.settled + 1, 0)  # in a row: a bounce starts anew
     success = settled >= scene.task.settle_steps
     return state.replace(
         settled=settled,
@@ -179,6 +185,7 @@ def _measure(scene: scenes.Scene, state: EnvState, contacts: "physics.Contacts")
             [arm_motion.angles_of(bound, q_arm) for bound, q_arm in zip(scene.arms, q)]
         )
     opening = physics.openings(scene, qpos)
+    # A difference of poses, as a robot's controller would report it.
     velocity = CONTROL_HZ * (pose.p - state.pose.p)
     readings = SimReadings(
         qpos,
@@ -210,8 +217,8 @@ def _measure(scene: scenes.Scene, state: EnvState, contacts: "physics.Contacts")
         measurements=measurements,
         thread=None if scene.task.thread is None else scene.task.thread(measurements),
         rcm_error=rcm_error,
-        rcm_error_within=jnp.maximum(state.rcm_error_within, rcm_error),
-        collided=state.collided | hit,
+        rcm_error_within=jnp.maximum(state.rcm_error_within, rcm_error),  # the worst substep counts
+        collided=state.collided | hit,  # for the whole episode: damage is not undone
     )
 
 

@@ -52,7 +52,7 @@ def forward(chain: Chain, q: jax.Array) -> tuple[Pose, jax.Array, jax.Array]:
     p, R = jnp.asarray(chain.p_base), jnp.asarray(chain.R_base)
     origins, axes = [], []
     for i, is_slide in enumerate(chain.slides):
-        p = p + R @ chain.offsets[i]
+        p = p + R @ chain.offsets[i]  # in the frame before the joint turns
         R = R @ chain.rotations[i]
         if is_slide:
             p = p + q[i] * R[:, 2]
@@ -101,7 +101,7 @@ def solve(
     def iterate(i, q):
         pose, origins, axes = forward(chain, q)
         J = _jacobian(chain, pose, origins, axes, ROTATION_WEIGHT)
-        missing = _error(pose, target)
+        missing = _error(pose, target)  # [6]: m, and rad times ROTATION_WEIGHT
         # Null-space term: dq = free + J+ (missing - J free) reaches the same pose, with the part of
         # `free` in the null space of J.
         if is_redundant:
@@ -109,7 +109,9 @@ def solve(
             dq = free + _least_squares(J, missing - J @ free)
         else:
             dq = _least_squares(J, missing)
+        # Shortened as a whole: the direction stays, while the linearisation holds only nearby.
         dq = dq * jnp.minimum(1.0, MAX_STEP / jnp.maximum(jnp.max(jnp.abs(dq)), 1e-9))
+        # Joints at their limit stay there; the next iteration moves the others.
         return jnp.clip(q + dq, low, high)
 
     q = jax.lax.fori_loop(0, iterations, iterate, q)
@@ -125,9 +127,11 @@ def residual(chain: Chain, target: Pose, q: jax.Array) -> jax.Array:
 def _jacobian(
     chain: Chain, pose: Pose, origins: jax.Array, axes: jax.Array, rotation_weight: float
 ) -> jax.Array:
+    # hinge: v = z x (p_tip - p_joint), w = z
     moves, turns = jnp.cross(axes, pose.p - origins), axes
     if any(chain.slides):
         slides = np.array(chain.slides)[:, None]
+        # slide: v = z, w = 0
         moves, turns = jnp.where(slides, axes, moves), jnp.where(slides, 0.0, axes)
     return jnp.concatenate([moves.T, rotation_weight * turns.T])
 
@@ -137,12 +141,13 @@ def _least_squares(J: jax.Array, missing: jax.Array) -> jax.Array:
     joints = J.shape[1]
     if joints < POSE_SIZE:
         return linear.solve_positive(J.T @ J + DAMPING**2 * jnp.eye(joints), J.T @ missing)
+    # J' (J J' + damping^2)^-1: the damping bounds dq near a singular configuration.
     return J.T @ linear.solve_positive(J @ J.T + DAMPING**2 * jnp.eye(POSE_SIZE), missing)
 
 
 def rotation_between(R: jax.Array, R_target: jax.Array) -> jax.Array:
     """Returns the rotation vector `[3]` rad, in the world, from `R` to `R_target`."""
-    E = R_target @ R.T
+    E = R_target @ R.T  # in the world: the Jacobian's rotations are, too
     # v = sin(angle) axis, and trace E = 1 + 2 cos(angle).
     v = 0.5 * jnp.stack([E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1]])
     sine_sq = jnp.sum(v * v)

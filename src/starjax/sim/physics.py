@@ -117,13 +117,17 @@ def advance(
             qpos=state.qpos,
             qvel=state.qvel,
             qacc_warmstart=state.qacc_warmstart,
+            # A new target each substep: a step in the target would be a blow to the servo.
             ctrl=target(i),
             mocap_pos=mocap_pos,
         )
         forces, memory = coupling.forces(scene, layout, state, gripper, p_world_trocar)
         data, error = solver.step(mjx_model, data, scene.max_solver_iterations, forces)
         contacts = Contacts(jnp.asarray(data._impl.contact.geom), data._impl.contact.dist)
+        # one bad substep makes the whole period invalid
         error = jnp.maximum(result.solver_error, error)
+        # Only what the next substep needs: the rest of mjx.Data would be carried through the
+        # loop.
         state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, memory)
         return state, StepResult(touching(scene, contacts), contacts, before, error)
 
@@ -159,10 +163,11 @@ def servo_targets(
         ctrl = jnp.zeros(scene.mj_model.nu)
         for a, bound in enumerate(scene.arms):
             # Cubic Hermite spline of s in [0, 1]: a straight line plus a term for the first slope.
+            # x(0) = q, x'(0) = velocity, x(1) = q + dq
             x = q[a] + s * dq[a] + s * (1 - s) ** 2 * turn[a]
-            v = (dq[a] + (1 - s) * (1 - 3 * s) * turn[a]) / period
+            v = (dq[a] + (1 - s) * (1 - 3 * s) * turn[a]) / period  # dx/ds / period
             # A critically damped servo lags its input by 2/w v + a/w^2: added in advance.
-            acceleration = (6 * s - 4) * turn[a] / period**2
+            acceleration = (6 * s - 4) * turn[a] / period**2  # d2x/ds2 / period^2
             w = bound.arm.servo_frequency
             ctrl = ctrl.at[bound.ctrl].set(x + 2.0 / w * v + acceleration / w**2)
             if bound.jaw_ctrl is not None:
@@ -184,6 +189,7 @@ def is_sound(scene: Scene, state: PhysicsState) -> jax.Array:
 def openings(scene: Scene, qpos: jax.Array) -> jax.Array:
     """Returns the jaws' measured openings `[A]`: -1 closed on nothing, +1 fully open."""
     values = [
+        # without jaws: open
         jnp.ones(()) if bound.jaw is None else 2.0 * qpos[bound.jaw] / bound.tool.open - 1.0
         for bound in scene.arms
     ]
@@ -201,6 +207,7 @@ def kinematics(
     data = scene.mjx_data.replace(qpos=qpos, mocap_pos=mocap_pos)
     if scene.task.still is not None and layout is not None:
         still = scene.task.still(layout)
+        # scipy's order is x y z w, MuJoCo's w x y z.
         turn = jnp.roll(Rotation.from_matrix(still.R).as_quat(), 1, axis=-1)  # w first
         data = data.replace(
             mocap_pos=mocap_pos.at[scene.still_mocap].set(still.p),
@@ -211,8 +218,8 @@ def kinematics(
 
 def touching(scene: Scene, contacts: Contacts) -> jax.Array:
     """Returns `[A]` bool, True if a pad overlaps something graspable."""
-    close = contacts.dist < 0
-    held = jnp.any(_any_of(contacts.geom, scene.graspable), axis=-1)
+    close = contacts.dist < 0  # overlap: MJX keeps pairs that are only near, too
+    held = jnp.any(_any_of(contacts.geom, scene.graspable), axis=-1)  # [C]: one of both geoms
     touched = [
         jnp.any(close & held & jnp.any(_any_of(contacts.geom, bound.pads), axis=-1))
         for bound in scene.arms

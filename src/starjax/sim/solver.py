@@ -85,15 +85,16 @@ def step(
     d = mjx.fwd_position(m, d)
     d = mjx.fwd_velocity(m, d)
     d = mjx.fwd_actuation(m, d)
-    smooth = d.qfrc_passive - d.qfrc_bias + d.qfrc_actuator
+    smooth = d.qfrc_passive - d.qfrc_bias + d.qfrc_actuator  # f: all forces but the constraints'
     d = d.replace(qfrc_smooth=smooth if applied is None else smooth + applied)
     x, force, error = solve(problem(m, d), d.qacc_warmstart, m.opt.timestep, max_iterations)
     # As `mjx.implicit`: servos and dampers at the velocity after the step. `mjx.euler` then only
     # integrates, since the model lets it do nothing about damping (flag eulerdamp).
     by_velocity = mjx.deriv_smooth_vel(m, d)
     assert by_velocity is not None, "a model without actuators and dampers"
-    damped = d._impl.M - m.opt.timestep * by_velocity
+    damped = d._impl.M - m.opt.timestep * by_velocity  # M - h df/dv
     d = d.replace(qacc=linear.solve_positive(damped, d.qfrc_smooth + force))
+    # x, not the damped acceleration, is where the next step's Newton iteration begins.
     d = mjx.euler(m, d).replace(qacc=x, qacc_warmstart=x, qfrc_constraint=force)
     return d, error
 
@@ -101,12 +102,14 @@ def step(
 def problem(m: mjx.Model, d: mjx.Data) -> Problem:
     """Returns the problem of a state with computed positions, velocities and actuators."""
     rows = d._impl
-    root = jnp.sqrt(rows.efc_D)
+    root = jnp.sqrt(rows.efc_D)  # of the stiffness: the metric becomes Euclidean
     return Problem(
         M=rows.M,
         f=d.qfrc_smooth,
         A=root[:, None] * rows.efc_J,
         b=root * rows.efc_aref,
+        # The scaled tangents are sqrt(impratio) stiffer: the cone of friction mu is narrower in
+        # these units.
         mu=rows.contact.friction[:, 0] / jnp.sqrt(m.opt.impratio),
         equalities=int(rows.ne),
     )
@@ -154,29 +157,31 @@ def solve(
     weights = 1.0 / jnp.diagonal(M)
 
     def at(x: jax.Array, Mx: jax.Array, r: jax.Array) -> Iterate:
-        return Iterate(x, Mx, r, Mx - f + pull(problem, r) @ A)
+        return Iterate(x, Mx, r, Mx - f + pull(problem, r) @ A)  # M x - f + A' (r - nearest point)
 
     def is_coarse(now: Iterate) -> jax.Array:
-        return jnp.sum(now.gradient**2 * weights) > limit
+        return jnp.sum(now.gradient**2 * weights) > limit  # g' diag(M)^-1 g
 
     def improve(now: Iterate) -> Iterate:
         # Newton direction: (M + B'B) p = -gradient. The cost's slope at x + s p is
         # (M x - f) p + s p M p + pull(r + s A p) A p.
         B = half_hessian(problem, now.r)
         p = -linear.solve_positive(M + B.T @ B, now.gradient)
-        Mp, Ap = M @ p, A @ p
-        slope_0, bend = p @ (now.Mx - f), p @ Mp
+        Mp, Ap = M @ p, A @ p  # once: candidates then cost O(E), not O(V^2)
+        slope_0, bend = p @ (now.Mx - f), p @ Mp  # smooth part of the slope, linear in the fraction
 
         def slope(fraction: jax.Array) -> jax.Array:
             return slope_0 + fraction * bend + pull(problem, now.r + fraction * Ap) @ Ap
 
+        # A full Newton step overshoots where a contact changes its zone.
         fraction = line_search(slope, now.gradient @ p)
+        # no new products
         return at(now.x + fraction * p, now.Mx + fraction * Mp, now.r + fraction * Ap)
 
     start = at(x, M @ x, A @ x - b)
     end = iteration.improve_while(is_coarse, improve, start, max_iterations)
-    error = 0.5 * timestep**2 * jnp.sum(end.gradient**2 * weights)
-    return end.x, -pull(problem, end.r) @ A, error
+    error = 0.5 * timestep**2 * jnp.sum(end.gradient**2 * weights)  # (h e)' M (h e) / 2, J
+    return end.x, -pull(problem, end.r) @ A, error  # A' lambda: forces push back into the set
 
 
 def size_factor(velocities: int) -> float:
@@ -202,7 +207,7 @@ def line_search(slope: Callable[[jax.Array], jax.Array], first: jax.Array) -> ja
     for second in (False, True):
         fractions = low + (high - low) * between if second else jnp.asarray(FIRST_FRACTIONS)
         values = jax.vmap(slope)(fractions)
-        falls = values < 0
+        falls = values < 0  # candidates before the minimum: convex, so the slope changes sign once
         low = jnp.max(fractions, where=falls, initial=low)
         high = jnp.min(fractions, where=~falls, initial=high)
         slopes = (
@@ -211,6 +216,8 @@ def line_search(slope: Callable[[jax.Array], jax.Array], first: jax.Array) -> ja
         )
     rise = slopes[1] - slopes[0]
     is_enclosed = jnp.isfinite(rise) & (rise > 0)
+    # Secant, exact where no contact changes its zone: the slope is piecewise linear up to the
+    # cones' curvature.
     fraction = jnp.where(is_enclosed, -slopes[0] / jnp.where(is_enclosed, rise, 1.0), 1.0)
     return low + (high - low) * jnp.clip(fraction, 0.0, 1.0)
 
@@ -234,11 +241,14 @@ def half_hessian(problem: Problem, r: jax.Array) -> jax.Array:
     """
     others, contacts = _split(problem, r)
     A_others, A_contacts = problem.A[: len(others)], problem.A[len(others) :]
+    # [C, V] each
     normal, first, second = jnp.moveaxis(A_contacts.reshape(-1, 3, A_contacts.shape[1]), 1, 0)
     x, y = contacts.along[:, :1], contacts.along[:, 1:]
+    # rows turned to the slip's direction
     along, across = x * first + y * second, x * second - y * first
     mu, sticks = contacts.mu, contacts.sticks
-    slips = ~sticks & (contacts.depth > 0)
+    slips = ~sticks & (contacts.depth > 0)  # the rest is inside the cone: no cost
+    # Unit normal of the cone's surface at the nearest point, (1, -mu) / sqrt(1 + mu^2).
     outward = jnp.where(slips, (normal - mu * along) * jax.lax.rsqrt(1.0 + mu**2), 0.0)
     rows = (
         jnp.where(_holds(problem, others)[:, None], A_others, 0.0),
@@ -275,14 +285,17 @@ def _split(problem: Problem, r: jax.Array) -> tuple[jax.Array, _Contacts]:
     mu, normal, tangents = problem.mu[:, None], r[:, :1], r[:, 1:]
     square = jnp.sum(tangents**2, -1, keepdims=True)
     is_sideways = square > 0
-    size = jnp.sqrt(jnp.where(is_sideways, square, 1.0))
+    size = jnp.sqrt(jnp.where(is_sideways, square, 1.0))  # both sides finite: NaN-free gradients
     along = jnp.where(is_sideways, tangents / size, np.array([1.0, 0.0], np.float32))
     sideways = jnp.where(is_sideways, size, 0.0)
+    # Distance mu t - n along the axis; the projection on the cone's normal divides by 1 + mu^2.
     depth = jnp.maximum(mu * sideways - normal, 0.0) / (1.0 + mu**2)
+    # curvature mu / t of the cone's circle, times depth
     bend = jnp.where(is_sideways, mu * depth / size, 0.0)
     return others, _Contacts(r, along, mu, mu * normal + sideways <= 0, depth, bend)
 
 
 def _holds(problem: Problem, others: jax.Array) -> jax.Array:
     """Returns True for the active rows before the contacts': equalities and exceeded limits."""
+    # An equality always pulls; a limit only once it is exceeded (r < 0).
     return (others < 0) | jnp.asarray(np.arange(others.shape[0]) < problem.equalities)

@@ -1,28 +1,35 @@
 """Training from a dataset to a finished state: resume, log, checkpoint, stop."""
 
 import functools
+import itertools
 import pathlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax.core import config, errors, methods
+from starjax.core import config, methods
 from starjax.data import normalizer, windows
 from starjax.policies import features
 from starjax.policies import policy as policies
 from starjax.rcm import arrays
 from starjax.runtime import background, precompile, processes, progress
 from starjax.sim.task import Task
-from starjax.training import checkpoint, devices, holdout, log, metrics, redrawing, stepper
+from starjax.training import batches, checkpoint, devices, holdout, log, redrawing
 from starjax.training import state as states
-from starjax.training.sharding import StateLayout, StepCarry
-from starjax.training.start import Start, first_params, fitted
-from starjax.training.step import Setup
-from starjax.training.stepper import Stepper
+from starjax.training import step as steps
+from starjax.training.sharding import Setup, StateLayout, StepCarry
+from starjax.training.start import (
+    Start,
+    check_same,
+    first_params,
+    fitted,
+    observed,
+    restored,
+)
 
 _CALL_SECONDS = 1.0  # target duration of a compiled call, which delays Ctrl-C and the bar
 
@@ -94,11 +101,11 @@ def run(
       StorageError: the disk is full.
       UsageError: the directory holds a training of another seed, of other demonstrations, or of
         more steps; or no loss of a whole stretch of the log was finite. That its method and
-        settings are these is for the caller to see to, as `commands.folders.claim` does.
+        settings are these is for the caller to see to, as `cli.folders.claim` does.
     """
     directory = pathlib.Path(directory)
     mesh = devices.make_mesh(train_config.batch_size, mesh_devices)
-    dataset = _observed(dataset, policy_config, features.select_sensors(task, cameras))
+    dataset = observed(dataset, policy_config, features.select_sensors(task, cameras))
     start = start or fitted(method, policy_config, train_config, dataset, task)
     stats, frames, held_out, given = start
     policy = policies.make(method, policy_config, task, train_config, cameras)
@@ -117,11 +124,18 @@ def run(
     layout = StateLayout(mesh, policy.cast_params, shapes)
     setup = Setup(policy, optimizer, policy_config, train_config, layout)
     resident = windows.on_device(dataset)
-    steps = None
-    if resident:
-        steps = stepper.resident(setup, dataset, frames, is_new, step_program, draw_images)
+    data: tuple[Any, ...] = ()
+    if resident or train_config.randomise:
+        placed = dataset if resident else windows.places(dataset)
+        data = batches.on_devices(setup, placed, frames)
+    loops = resident and steps.runs_in_a_loop(policy_config)
+    step = step_program if resident else None
+    step = step or (steps.loop_program if loops else steps.batch_program)(setup)
+    if resident and is_new:
+        steps.prepare(step, setup, data, loops)
+    displace = redrawing.make(setup, draw_images, data, ahead=is_new)
 
-    state = _restored(directory / "checkpoints", shapes)
+    state = restored(directory / "checkpoints", shapes)
     if state is None:
         # Arguments, not constants: the program is the same for every seed.
         make = functools.partial(states.create, policy, optimizer)
@@ -130,7 +144,7 @@ def run(
         del params
         state = devices.replicate(state, mesh)
     else:
-        _check_same(directory, state, streams.steps, stats, train_config.steps)
+        check_same(directory, state, streams.steps, stats, train_config.steps)
     del drawn, start, given  # frees the initial parameters
 
     holdout_error = None
@@ -142,107 +156,83 @@ def run(
     if int(state.step) == train_config.steps:
         held_out_errors = holdout_error(processes.own(state)) if holdout_error else {}
         return TrainingResult(state, 0.0, int(state.skipped), held_out_errors)
-    if steps is None:
-        steps = stepper.streamed(setup, dataset, frames, state, draw_images)
-    step, carry = int(state.step), steps.begin(state)
+    number, key = int(state.step), jnp.copy(state.key)  # the steps take the state's memory
+    if loops:
+        stream = itertools.repeat(data)
+    elif resident:
+        stream = batches.resident(setup, data, key, number, displace)
+    else:
+        stream = batches.streamed(setup, dataset, frames, key, number, data, displace)
+    to_carry, to_state = layout.transfers()
+    carry = to_carry(state)
     del state  # on several devices, memory that the steps may need
     return _train(
-        steps, carry, step, train_config, directory, holdout_error, should_stop, description
+        *(setup, step, stream, loops, carry, to_state, number),
+        *(directory, holdout_error, should_stop, description),
     )
 
 
 def _train(
-    stepper: Stepper,
-    carry: StepCarry,
-    step: int,
-    train_config: config.TrainConfig,
+    setup: Setup,
+    step: precompile.Program,
+    batches: Iterator[Any],
+    loops: bool,
+    state: StepCarry,
+    to_state: Callable[[StepCarry], states.TrainState],
+    number: int,
     directory: pathlib.Path,
     holdout_error: HoldoutError | None,
     should_stop: Callable[[], bool],
     description: str,
 ) -> TrainingResult:
-    """Takes the remaining steps, with regular lines of the log and checkpoints."""
-    last, saved, held_out_errors = train_config.steps, step, {}
+    """Takes the steps after `number`, with regular lines of the log and checkpoints."""
+    train_config, mesh = setup.train_config, setup.layout.mesh
+    last, saved, held_out_errors = train_config.steps, number, {}
     pace = _Pace(train_config.batch_size)
-    with progress.track(description, last, unit="steps", done=step) as show:
+    with progress.track(description, last, unit="steps", done=number) as show:
         note, call = "", 1
-        while step < last:
+        while number < last:
             # Processes of one run stop together, and after the same steps.
             stop, calls = processes.gathered(should_stop(), call)
             if any(stop):
-                if step > saved:
-                    _save(directory, stepper.end(carry), train_config)
+                if number > saved:
+                    _save(directory, to_state(state), train_config)
                 raise Interrupted(
-                    f"stopped after step {step} of {last}; its checkpoint is in {directory}, the "
+                    f"stopped after step {number} of {last}; its checkpoint is in {directory}, the "
                     "same command resumes from it"
                 )
-            stops = _next(step, train_config.log_every), _next(step, train_config.checkpoint_every)
-            count = min(step + calls[0], *stops, last) - step
-            start = time.monotonic()
-            carry = stepper.run(carry, count)
-            jax.block_until_ready(carry.state.step)
-            call = pace.next_call(count, time.monotonic() - start, train_config.steps_per_call)
-            step += count
-            if step in (stops[0], last):
-                carry, note = _log(directory / "metrics.jsonl", step, carry, train_config)
-            if step in (stops[1], last):
-                state = stepper.end(carry)  # by all processes together
+            log_at = _next(number, train_config.log_every)
+            save_at = _next(number, train_config.checkpoint_every)
+            count = min(number + calls[0], log_at, save_at, last) - number
+
+            began = time.monotonic()
+            if loops:  # the program draws the batches of all these steps itself
+                dataset = next(batches)
+                state = step(state, *dataset, devices.replicate(np.int32(count), mesh))
+            else:
+                compiled = None
+                for _ in range(count):
+                    batch = next(batches)
+                    # Once a call: the look-up reads the shapes of every leaf.
+                    compiled = compiled or step.select(state, batch)
+                    state = compiled(state, batch)
+            jax.block_until_ready(state.state.step)
+            call = pace.next_call(count, time.monotonic() - began, train_config.steps_per_call)
+            number += count
+
+            if number in (log_at, last):
+                state, note = _log(directory / "metrics.jsonl", number, state, train_config)
+            if number in (save_at, last):
+                whole = to_state(state)  # by all processes together
                 if holdout_error:
-                    held_out_errors = holdout_error(processes.own(state))
-                    log.append(directory / "metrics.jsonl", step, "holdout", held_out_errors)
-                _save(directory, state, train_config)
-                saved = step
-                del state
+                    held_out_errors = holdout_error(processes.own(whole))
+                    log.append(directory / "metrics.jsonl", number, "holdout", held_out_errors)
+                _save(directory, whole, train_config)
+                saved = number
+                del whole
             show(count, note=note)
-    state = stepper.end(carry)
-    return TrainingResult(state, pace.samples_per_second, int(state.skipped), held_out_errors)
-
-
-def _observed(
-    dataset: windows.Dataset, policy_config: config.PolicyConfig, seen: features.Sensors
-) -> windows.Dataset:
-    """Removes observations that the policy does not use: gathering them would take time."""
-    observation = dataset.observation
-    kept = "images" if policy_config.observation == "image" else "state"
-    kept = "features" if policy_config.freeze_encoder else kept
-    images = {name: (observation.images or {}).get(name) for name in seen.cameras}
-    unseen = {name: None for name in ("images", "state", "features", "endoscope") if name != kept}
-    return dataset.replace(observation=observation._replace(**{"images": images, **unseen}))
-
-
-def _restored(checkpoints: pathlib.Path, shapes: Any) -> states.TrainState | None:
-    """Returns the state of the newest sound checkpoint, None without one."""
-    restored = checkpoint.restore(checkpoints, shapes) if checkpoint.steps(checkpoints) else None
-    step = -1 if restored is None else restored[0]
-    if processes.agree(step) != (step,):
-        raise errors.UsageError(
-            str(checkpoints.parent), "a folder that all processes share", "other checkpoints in it"
-        )
-    return None if restored is None else restored[1]
-
-
-def _check_same(
-    directory: pathlib.Path,
-    state: states.TrainState,
-    key: jax.Array,
-    stats: normalizer.Normalizer,
-    steps: int,
-) -> None:
-    """Raises UsageError for a state of another training."""
-    if not np.array_equal(jax.random.key_data(state.key), jax.random.key_data(key)):
-        raise errors.UsageError("seed", f"that of the training in {directory}", "another")
-    if not all(map(_alike, jax.tree.leaves(state.normalizer), jax.tree.leaves(stats))):
-        raise errors.UsageError(
-            "the demonstrations", f"those of the training in {directory}", "others"
-        )
-    if int(state.step) > steps:
-        done = f"{state.step} or more, which the training in {directory} has done"
-        raise errors.UsageError("train.steps", done, steps)
-
-
-def _alike(one: Any, other: Any) -> bool:
-    """Returns True for statistics of the same data; last bits vary between processors."""
-    return np.shape(one) == np.shape(other) and np.allclose(one, other, rtol=1e-5, atol=1e-6)
+    whole = to_state(state)
+    return TrainingResult(whole, pace.samples_per_second, int(whole.skipped), held_out_errors)
 
 
 def _log(
@@ -250,7 +240,7 @@ def _log(
 ) -> tuple[StepCarry, str]:
     """Writes the means since the last line and restarts the sums; returns a note for the bar."""
     state, skipped = carry.state, int(carry.state.skipped)
-    values = metrics.means(state.sums, step, skipped, train_config)
+    values = states.mean_metrics(state.sums, step, skipped, train_config)
     here = values.pop("skipped")
     # The optimiser counts from 0 and sees no skipped step.
     rate = states.learning_rate(train_config)(step - 1 - skipped)
@@ -259,7 +249,7 @@ def _log(
         log.append(path, step, "train", values)
     note = f"loss {values['loss']:.4f}" if "loss" in values else "no finite loss"
     note += f", {here} steps skipped" if here else ""
-    return carry._replace(state=state.replace(sums=metrics.restarted(state.sums))), note
+    return carry._replace(state=state.replace(sums=states.restarted(state.sums))), note
 
 
 def _save(

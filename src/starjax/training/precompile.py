@@ -16,10 +16,10 @@ from starjax.rcm import arrays
 from starjax.runtime import precompile
 from starjax.sim import wrists
 from starjax.sim.task import Task
-from starjax.training import devices, stepper
+from starjax.training import devices
 from starjax.training import state as states
-from starjax.training.sharding import StateLayout
-from starjax.training.step import Setup, runs_in_a_loop
+from starjax.training import step as steps
+from starjax.training.sharding import Setup, StateLayout
 
 
 @arrays.broadcasting
@@ -42,7 +42,7 @@ def step_program(
     Returns:
       the program; None if it depends on a dataset (`step.runs_in_a_loop`) whose size is unknown.
     """
-    loops = runs_in_a_loop(policy_config)
+    loops = steps.runs_in_a_loop(policy_config)
     if loops and not rows:
         return None
     mesh = devices.make_mesh(train_config.batch_size)
@@ -62,13 +62,13 @@ def step_program(
     setup = Setup(policy, optimizer, policy_config, train_config, layout)
     seen = features.select_sensors(task, cameras)
     if loops:
-        program = stepper.loop_program(setup)
+        program = steps.loop_program(setup)
         dataset = dataset_shapes(policy_config, demos, rows, seen)
-        program.prepare(*stepper.loop_arguments(setup, dataset))
+        program.prepare(*steps.loop_arguments(setup, dataset))
     else:
-        program = stepper.batch_program(setup)
+        program = steps.batch_program(setup)
         batch = batch_shapes(policy_config, train_config.batch_size, seen)
-        program.prepare(*stepper.abstract_arguments(setup, batch))
+        program.prepare(*steps.batch_arguments(setup, batch))
     return program
 
 

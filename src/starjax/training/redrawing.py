@@ -13,11 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from starjax.core import errors
 from starjax.core.types import Pose
 from starjax.runtime.precompile import Program
 from starjax.sim.state import ImageSource
-from starjax.training import devices, randomise
-from starjax.training import step as steps
+from starjax.training import batches, devices, randomise
+from starjax.training.sharding import Setup
 
 # (ImageSource of one moment) -> camera's name -> image; its cameras follow the source's poses.
 Draw = Callable[[ImageSource], Mapping[str, Any]]
@@ -39,16 +40,26 @@ class Displaced(NamedTuple):
 
 
 def make(
-    setup: steps.Setup, draw: Draw, data: tuple[Any, ...], ahead: bool
-) -> Callable[[jax.Array, int], Displaced]:
+    setup: Setup, draw: Draw | None, data: tuple[Any, ...], ahead: bool
+) -> Callable[[jax.Array, int], Displaced | None]:
     """Makes the function from the key of all steps and a step's number to its images.
 
     Args:
       setup: of the training.
-      draw: images of one moment.
-      data: dataset, frames and their number, see `steps.choose`; on every device.
+      draw: images of one moment; needed if a disturbance draws them anew.
+      data: dataset, frames and their number, see `batches.on_devices`.
       ahead: compile the program in the background.
+
+    Raises:
+      UsageError: there are no sources of images, or no function that draws them.
     """
+    if not randomise.redraws(setup.train_config):
+        return lambda key, step: None
+    if draw is None or data[0].sources is None:
+        expected = (
+            "neither camera nor look without sources of images and a function that draws them"
+        )
+        raise errors.UsageError(randomise.ARGUMENT, expected, "one of them")
     mesh, train_config = setup.layout.mesh, setup.train_config
     share = randomise.redrawn_count(train_config.batch_size // mesh.size)
     at_once = AT_ONCE.get(mesh.devices.flat[0].platform, AT_ONCE["gpu"])
@@ -71,7 +82,7 @@ def make(
 
 
 def draw_images(
-    setup: steps.Setup,
+    setup: Setup,
     draw: Draw,
     count: int,
     key: jax.Array,
@@ -83,8 +94,8 @@ def draw_images(
     """Draws `Displaced.images` of the steps `first`, .. `first + count - 1`."""
     names = list(randomise.max_levels(setup.train_config))
 
-    def chosen(step: jax.Array) -> steps.Choice:
-        return steps.choose(setup, key, step, dataset, frames, available)
+    def chosen(step: jax.Array) -> batches.Choice:
+        return batches.choose(setup, key, step, dataset, frames, available)
 
     choice = jax.vmap(chosen, out_axes=1)(first + jnp.arange(count))  # [B, S]
     episode = dataset.episode[choice.frame]

@@ -11,9 +11,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optax
 from jax.sharding import Mesh
 
-from starjax.policies.base import Params
+from starjax.core import config
+from starjax.policies.base import Params, Policy
 from starjax.policies.models import kernels
 from starjax.training import devices
 from starjax.training.state import TrainState
@@ -50,6 +52,18 @@ class StateLayout(NamedTuple):
     mesh: Mesh
     round: Callable[[Params], Params]
     whole: Any
+
+    def transfers(
+        self,
+    ) -> tuple[Callable[[TrainState], StepCarry], Callable[[StepCarry], TrainState]]:
+        """Returns `to_carry` and `to_state`, compiled where matrices move between devices."""
+        if self.mesh.size == 1:
+            return self.to_carry, self.to_state
+        whole = devices.replicated(self.mesh)
+        return (
+            jax.jit(self.to_carry, out_shardings=self.shardings()),
+            jax.jit(self.to_state, out_shardings=whole),
+        )
 
     def to_carry(self, state: TrainState) -> StepCarry:
         """Lays out a whole state."""
@@ -169,6 +183,24 @@ class StateLayout(NamedTuple):
         names = {getattr(key, "key", None) for key in path}
         large = x.ndim > 1 and x.size >= LARGE and x.size % count == 0
         return count > 1 and large and not names & {"vision", "depth"}
+
+
+class Setup(NamedTuple):
+    """Constants of a training, used by every step.
+
+    Attributes:
+      policy: to be trained.
+      optimizer: from `state.make_optimizer`.
+      policy_config: the horizons of a window.
+      train_config: batch size and averaging.
+      layout: of the state on the devices.
+    """
+
+    policy: Policy
+    optimizer: optax.GradientTransformation
+    policy_config: config.PolicyConfig
+    train_config: config.TrainConfig
+    layout: StateLayout
 
 
 @functools.partial(jax.jit, static_argnums=1)  # called outside of any, one program for all of them

@@ -1,7 +1,7 @@
 """The state of a training run: the carry of its steps and the content of its checkpoints."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import flax.struct
@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from starjax.core import config
+from starjax.core import config, errors
 from starjax.data import normalizer
 from starjax.policies.base import Params, Policy
 from starjax.runtime.precompile import Program
-from starjax.training import metrics
+
+Sums = dict[str, jax.Array]
 
 _QUICK = {"xla_backend_optimization_level": 0}
 
@@ -64,7 +65,7 @@ class TrainState:
       normalizer: fitted once; on resume it is the checkpoint's.
       key: `Streams.steps`.
       skipped: int32 `[]`, steps whose loss or gradient was not finite.
-      sums: of `metrics`, since the last line of the log.
+      sums: of the metrics since the last line of the log, on the device.
     """
 
     step: Any
@@ -74,7 +75,7 @@ class TrainState:
     normalizer: normalizer.Normalizer
     key: Any
     skipped: Any
-    sums: dict[str, Any]
+    sums: Sums
 
 
 def learning_rate(train_config: config.TrainConfig) -> optax.Schedule:
@@ -178,7 +179,7 @@ def create(
         normalizer=stats,
         key=key,
         skipped=jnp.int32(0),
-        sums=metrics.zeros(policy.metrics),
+        sums=zero_sums(policy.metrics),
     )
 
 
@@ -198,3 +199,50 @@ def shapes(
 def ema_decay(step: jax.Array, ema_max: float) -> jax.Array:
     """Returns 1 - (1 + s)^-0.75, at most `ema_max`: young averages forget fast."""
     return jnp.minimum(1.0 - (1.0 + step) ** -0.75, ema_max)
+
+
+def zero_sums(names: Iterable[str]) -> Sums:
+    """Returns the sums of no steps; `names` are the policy's own metrics."""
+    own = ("loss", "gradient_norm", "taken", "skipped")
+    return {name: jnp.float32(0.0) for name in (*own, *names)}
+
+
+def add_metrics(sums: Sums, values: dict[str, jax.Array], finite: jax.Array) -> Sums:
+    """Adds the metrics of one step, which was taken if they are finite."""
+    after = {name: sums[name] + jnp.where(finite, values[name], 0.0) for name in values}
+    after["taken"] = sums["taken"] + jnp.where(finite, 1.0, 0.0)
+    after["skipped"] = sums["skipped"] + jnp.where(finite, 0.0, 1.0)
+    return after
+
+
+def restarted(sums: Sums) -> Sums:
+    """Returns zeros, placed as the sums are: another placement would be another program."""
+    return jax.tree.map(lambda x: jax.device_put(jnp.zeros_like(x), x.sharding), sums)
+
+
+def mean_metrics(
+    sums: Sums, step: int, skipped: int, train_config: config.TrainConfig
+) -> dict[str, float]:
+    """Returns the means over the steps that were taken, and how many were skipped.
+
+    Args:
+      sums: since the last line of the log.
+      step: steps so far.
+      skipped: of all of them.
+      train_config: has the number of steps between two lines.
+
+    Raises:
+      errors.UsageError: nothing was finite in a whole stretch. A single step says nothing, as where
+        the training's end cuts a stretch short.
+    """
+    values = {name: float(value) for name, value in sums.items()}
+    taken, here = int(values.pop("taken")), int(values.pop("skipped"))
+    if taken == 0 and (here >= max(train_config.log_every, 2) or 1 < step == skipped):
+        raise errors.UsageError(
+            "train.learning_rate",
+            "one at which losses stay finite",
+            f"{train_config.learning_rate:g}, none finite in {here} steps before step {step}",
+            "lower it, or use policy.dtype float32",
+        )
+    values = {name: value / taken for name, value in values.items()} if taken else {}
+    return {**values, "skipped": here}

@@ -1,38 +1,21 @@
-"""One pure training step, and many of them in one compiled call."""
+"""One pure training step, many of them in one compiled call, and their programs."""
 
 import functools
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from starjax.core import config
 from starjax.data import windows
-from starjax.policies.base import Policy
 from starjax.rcm import arrays
-from starjax.training import devices, randomise
+from starjax.runtime.precompile import Program
+from starjax.training import batches, devices
 from starjax.training import state as states
-from starjax.training.metrics import added
-from starjax.training.sharding import StateLayout, StepCarry
-
-
-class Setup(NamedTuple):
-    """Constants of a training, used by every step.
-
-    Attributes:
-      policy: to be trained.
-      optimizer: from `state.make_optimizer`.
-      policy_config: the horizons of a window.
-      train_config: batch size and averaging.
-      layout: of the state on the devices.
-    """
-
-    policy: Policy
-    optimizer: optax.GradientTransformation
-    policy_config: config.PolicyConfig
-    train_config: config.TrainConfig
-    layout: StateLayout
+from starjax.training.sharding import Setup, StateLayout, StepCarry
 
 
 def resident_steps(
@@ -68,92 +51,10 @@ def resident_step(
     available: jax.Array,
 ) -> StepCarry:
     """Draws a batch and takes one step; see `resident_steps`."""
-    batch = drawn_batch(setup, carry.state.key, carry.state.step, dataset, frames, available)
-    return train_step(setup, carry, batch)
-
-
-class Choice(NamedTuple):
-    """Draws of a batch of B windows.
-
-    Attributes:
-      frame: int32 `[B]`, frames of the windows.
-      draws: their disturbances, None without any.
-      seen: int32 `[B, O]`, control steps that are observed, None without disturbances.
-    """
-
-    frame: jax.Array
-    draws: randomise.Draws | None = None
-    seen: jax.Array | None = None
-
-
-def choose(
-    setup: Setup,
-    key: jax.Array,
-    step: jax.Array,
-    dataset: windows.Dataset,
-    frames: jax.Array,
-    available: jax.Array,
-) -> Choice:
-    """Chooses the windows of a step; `key` and `step` are the state's.
-
-    It reads the places of the episodes only, see `windows.places`.
-    """
-    count, keys = setup.train_config.batch_size, states.step_keys(key, step)
-    frame = windows.sample_frames(keys.batch, frames, count, available)
-    levels = randomise.max_levels(setup.train_config)
-    if not levels:
-        return Choice(frame)
-    draws = randomise.draw(levels, keys.loss, count, count // setup.layout.mesh.size)
-    at = windows.control_steps(dataset, frame)
-    seen = randomise.seen_steps(list(levels), draws, at, setup.policy_config.obs_horizon)
-    return Choice(frame, draws, seen)
-
-
-def drawn_batch(
-    setup: Setup,
-    key: jax.Array,
-    step: jax.Array,
-    dataset: windows.Dataset,
-    frames: jax.Array,
-    available: jax.Array,
-    displaced: Any = None,
-) -> windows.Batch:
-    """Returns the batch of a step, split over the devices; `key` and `step` are the state's.
-
-    `displaced` is `redrawing.Displaced` if cameras are.
-    """
-    policy_config = setup.policy_config
-    choice = choose(setup, key, step, dataset, frames, available)
-    split = devices.batch_sharding(setup.layout.mesh)
-    choice = jax.tree.map(lambda x: jax.lax.with_sharding_constraint(x, split), choice)
-    batch = windows.gather(
-        dataset, choice.frame, policy_config.obs_horizon, policy_config.horizon, choice.seen
+    batch = batches.drawn_batch(
+        setup, carry.state.key, carry.state.step, dataset, frames, available
     )
-    return disturbed(setup, choice, batch, displaced)
-
-
-def disturbed(
-    setup: Setup, choice: Choice, batch: windows.Batch, displaced: Any = None
-) -> windows.Batch:
-    """Disturbs the images of a gathered batch."""
-    if choice.draws is None:
-        return batch
-    if displaced is not None:
-        displaced = jax.tree.map(lambda x: x[:, displaced.index], displaced.images)
-    names = list(randomise.max_levels(setup.train_config))
-
-    def change(draws: Any, seen: Any, observation: Any, displaced: Any) -> Any:
-        if displaced is not None:
-            images = {
-                name: randomise.with_first(image, displaced[name])
-                for name, image in observation.images.items()
-            }
-            observation = observation._replace(images=images)
-        return randomise.disturb(names, draws, seen, observation)
-
-    change = devices.on_shares(change, setup.layout.mesh)
-    observation = change(choice.draws, choice.seen, batch.observation, displaced)
-    return batch.replace(observation=observation)
+    return train_step(setup, carry, batch)
 
 
 @arrays.broadcasting  # which optax relies on
@@ -184,7 +85,7 @@ def _update(setup: Setup, carry: StepCarry, prepared: Any) -> StepCarry:
     ema_params = optax.incremental_update(params, state.ema_params, 1.0 - decay)
 
     metrics["gradient_norm"] = norm
-    sums = added(state.sums, metrics, finite)
+    sums = states.add_metrics(state.sums, metrics, finite)
 
     def keep(new: Any, old: Any) -> Any:
         return jax.tree.map(functools.partial(jax.lax.select, finite), new, old)
@@ -208,3 +109,53 @@ def runs_in_a_loop(policy_config: config.PolicyConfig) -> bool:
     synchronises with the host after each step, while single calls are dispatched ahead of time.
     """
     return policy_config.observation != "image" or policy_config.freeze_encoder
+
+
+def batch_program(setup: Setup) -> Program:
+    """Returns the program of one step on a batch: (StepCarry, Batch) -> StepCarry."""
+    return _program(functools.partial(train_step, setup), setup.layout)
+
+
+def loop_program(setup: Setup) -> Program:
+    """Returns the program of many steps: the arguments of `resident_steps` -> StepCarry."""
+    return _program(functools.partial(resident_steps, setup), setup.layout)
+
+
+def batch_arguments(setup: Setup, batch: windows.Batch) -> tuple[StepCarry, windows.Batch]:
+    """Returns shapes and shardings of the arguments of a step on a batch of these shapes."""
+    split = devices.batch_sharding(setup.layout.mesh)
+    return setup.layout.shapes(), jax.tree.map(lambda x: x.update(sharding=split), batch)
+
+
+def loop_arguments(setup: Setup, dataset: windows.Dataset) -> tuple[Any, ...]:
+    """Returns shapes and shardings of the arguments of steps on a dataset of these shapes."""
+    whole, number = devices.replicated(setup.layout.mesh), jax.ShapeDtypeStruct((), jnp.int32)
+    rows = jax.ShapeDtypeStruct(dataset.episode.shape, jnp.int32)
+    data = jax.tree.map(lambda x: x.update(sharding=whole), (dataset, rows, number, number))
+    return setup.layout.shapes(), *data
+
+
+def prepare(step: Program, setup: Setup, data: tuple[Any, ...], loops: bool) -> None:
+    """Compiles steps in the background until the first of them, unless they are prepared.
+
+    Args:
+      step: from `loop_program` if it `loops`, else from `batch_program`.
+      setup: of the training.
+      data: from `batches.on_devices`.
+      loops: see `runs_in_a_loop`.
+    """
+    carry, mesh = setup.layout.shapes(), setup.layout.mesh
+    if loops:
+        arguments = carry, *data, devices.replicate(np.int32(1), mesh)
+    else:
+        draw, state = batches.drawing(setup), carry.state
+        arguments = batch_arguments(setup, jax.eval_shape(draw, state.key, state.step, *data))
+    if not step.is_prepared(*arguments):
+        step.prepare(*arguments)
+
+
+def _program(body: Callable[..., StepCarry], layout: StateLayout) -> Program:
+    options = devices.compiler_options(layout.mesh)
+    return Program(
+        body, donate_argnums=0, out_shardings=layout.shardings(), compiler_options=options
+    )

@@ -69,20 +69,25 @@ def make(options: ActConfig, policy_config: config.PolicyConfig, sizes: "Sizes")
         }
 
     def prepare(key: jax.Array, x0: jax.Array) -> tuple[jax.Array, jax.Array]:
+        # noise of the style, z = mu + s eps
         return x0, jax.random.normal(key, (len(x0), options.style_dim))
 
     def loss(
         params: Params, condition: Condition, given: tuple[jax.Array, jax.Array]
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         x0, noise = given
+        # The encoder sees the demonstrated sequence: the style explains what observations cannot.
         style: Any = styles.apply(params["style"], x0, condition.state)
         said = decode(params["decoder"], transformer.drawn(style, noise), *condition)
+        # L1, KL to N(0, I)
         off, divergence = jnp.mean(jnp.abs(said - x0)), transformer.divergence(style)
+        # The negative evidence bound of a conditional autoencoder: reconstruction + beta * KL.
         return off + options.kl_weight * divergence, {"l1": off, "divergence": divergence}
 
     def sample(
         params: Params, keys: jax.Array, condition: Condition, reach: jax.Array | None
     ) -> jax.Array:
+        # The prior's mean: a decision is deterministic, as in ACT.
         z = jnp.zeros((len(keys), options.style_dim))
         return diffusion.within(decode(params["decoder"], z, *condition), reach)
 
@@ -90,6 +95,7 @@ def make(options: ActConfig, policy_config: config.PolicyConfig, sizes: "Sizes")
         return sequences.cast_params(params, {"kernel"}, dtype)
 
     def prepare_for_inference(params: Params) -> Params:
+        # styles are for training alone
         return {"decoder": kernels.packed(cast_params(params["decoder"]))}
 
     metrics = ("l1", "divergence")

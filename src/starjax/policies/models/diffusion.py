@@ -18,7 +18,7 @@ def add_noise(schedule: Schedule, x0: jax.Array, k: jax.Array, noise: jax.Array)
     """Computes Eq. 7: the noisy version of `x0` `[B, ...]` after step `k` (int `[B]` or `[]`)."""
     signal = _at(schedule.sqrt_alpha_bar, k, x0.ndim)
     spread = _at(schedule.sqrt_one_minus_alpha_bar, k, x0.ndim)
-    return signal * x0 + spread * noise
+    return signal * x0 + spread * noise  # a_k = sqrt(abar_k) a_0 + sqrt(1 - abar_k) eps
 
 
 class Noised(NamedTuple):
@@ -41,8 +41,8 @@ def noised(schedule: Schedule, key: jax.Array, x0: jax.Array) -> Noised:
     `key` is one typed key for the whole batch.
     """
     key_k, key_noise = jax.random.split(key)
-    k = jax.random.randint(key_k, x0.shape[:1], 0, schedule.steps)
-    noise = jax.random.normal(key_noise, x0.shape, x0.dtype)
+    k = jax.random.randint(key_k, x0.shape[:1], 0, schedule.steps)  # k ~ U{0, .., K - 1}, one a row
+    noise = jax.random.normal(key_noise, x0.shape, x0.dtype)  # eps ~ N(0, I)
     return Noised(add_noise(schedule, x0, k, noise), k, noise)
 
 
@@ -58,11 +58,13 @@ def predict_x0(schedule: Schedule, x: jax.Array, k: jax.Array, eps: jax.Array) -
     """
     signal = _at(schedule.sqrt_alpha_bar, k, x.ndim)
     spread = _at(schedule.sqrt_one_minus_alpha_bar, k, x.ndim)
+    # a_0 = (a_k - sqrt(1 - abar_k) eps) / sqrt(abar_k)
     return jnp.clip((x - spread * eps) / signal, -1.0, 1.0)
 
 
 def sample_noise(keys: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     """Draws standard normal `[B, *shape]`; row i depends on `keys[i]` alone."""
+    # A key a row: a trial's noise is the same in any batch.
     return jax.vmap(lambda key: jax.random.normal(key, shape, jnp.float32))(keys)
 
 
@@ -90,6 +92,7 @@ def ddim_sample(
       Clean sequences, the shape of `noise`, within `reach`.
     """
     table = schedules.ddim_table(diffusion_steps, steps)
+    # All embeddings of k at once: they depend on no sample.
     prepared = prepare(jnp.asarray(table.k))
 
     def step(x, inputs):
@@ -97,12 +100,15 @@ def ddim_sample(
         eps = eps_fn(x, at_k)
         # DDIM with eta = 0 (Song et al., 2021, Eq. 12): predict x0, then go to the next noise level
         x0 = (x - row.sqrt_one_minus_alpha_bar * eps) / row.sqrt_alpha_bar
+        # Data lie in `reach`: the clip keeps an error of eps, which sqrt(abar) = 5e-4 divides at
+        # first, from leaving it.
         x0 = within(x0, reach)
+        # Eq. 7 at k - K / n
         x = row.sqrt_alpha_bar_next * x0 + row.sqrt_one_minus_alpha_bar_next * eps
         return x, None
 
     rows = jax.tree.map(jnp.asarray, table)
-    x, _ = jax.lax.scan(step, noise, (rows, prepared))
+    x, _ = jax.lax.scan(step, noise, (rows, prepared))  # one trace of the network for n steps
     return x
 
 

@@ -40,7 +40,8 @@ def noised(key: jax.Array, x0: jax.Array) -> NoisedFlow:
     key_time, key_noise = jax.random.split(key)
     time = jax.random.uniform(key_time, x0.shape[:1])
     noise = jax.random.normal(key_noise, x0.shape, x0.dtype)
-    level = time.reshape(-1, *[1] * (x0.ndim - 1))
+    level = time.reshape(-1, *[1] * (x0.ndim - 1))  # [B, 1, ..]
+    # x_t = (1 - t) x0 + t eps, whose derivative in t is the same all along: v = eps - x0.
     return NoisedFlow(x0 + level * (noise - x0), time / TIME_UNIT, noise - x0)
 
 
@@ -48,6 +49,7 @@ def velocity_loss(
     predict: Callable[[jax.Array, jax.Array], jax.Array], batch: NoisedFlow
 ) -> jax.Array:
     """Returns the mean squared error of the velocity that `predict(x, time)` returns."""
+    # Its minimiser is E[v | x_t], the field that carries noise to data.
     return jnp.mean((predict(batch.x, batch.time) - batch.velocity) ** 2)
 
 
@@ -72,13 +74,13 @@ def sample(
         loop; `predict` gets its slice.
       reach: two bounds, each broadcast against `[B, ...]`.
     """
-    time = np.arange(steps, 0, -1, dtype=np.float32) / steps
+    time = np.arange(steps, 0, -1, dtype=np.float32) / steps  # 1, 1 - 1/n, .., 1/n: backwards
 
     def step(x: jax.Array, inputs: Any) -> tuple[jax.Array, None]:
         time, left, prepared = inputs
         # x = (1 - t) x0 + t noise and v = noise - x0, so x0 = x - t v; then noise at t - 1 / steps
         clean = within(x - time * predict(x, prepared), reach)
-        return clean + left * (x - clean), None
+        return clean + left * (x - clean), None  # linear in t: the next point is on the same line
 
     left = 1.0 - 1.0 / (steps * time)  # fraction of the path that remains after the step
     rows = (jnp.asarray(time), jnp.asarray(left), prepare(jnp.asarray(time / TIME_UNIT)))

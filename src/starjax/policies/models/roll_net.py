@@ -51,11 +51,13 @@ class RollNet(nn.Module):
           Rolls float32 `[B, H * N]`.
         """
         batch, horizon = p.shape[:2]
+        # Embed(lambda)
         embedded = nn.gelu(layers.Dense(self.embed_dim, name="embed")(trocar.astype(self.dtype)))
-        inputs = [p.reshape(batch, -1), embedded, roll_history]
+        inputs = [p.reshape(batch, -1), embedded, roll_history]  # x_rel = [p, Embed(lambda), gamma]
         if observed is not None:
             inputs.append(observed)
         x = jnp.concatenate([part.astype(self.dtype) for part in inputs], -1)
         x = layers.residual_mlp(x, self.width, self.blocks, self.dtype)
         size = horizon * self.outputs
+        # gamma_rel, t+1 .. t+H
         return layers.Dense(size, zero=True, name="out")(x).astype(jnp.float32)

@@ -69,8 +69,8 @@ def ddim_table(diffusion_steps: int, steps: int) -> DdimTable:
     if not 1 <= steps <= diffusion_steps:
         raise ValueError(f"steps: expected 1..{diffusion_steps} (the diffusion steps), got {steps}")
     _, alpha_bar = _beta_and_alpha_bar(diffusion_steps)
-    k = np.arange(steps)[::-1] * diffusion_steps // steps
-    following = np.append(alpha_bar[k[1:]], 1.0)
+    k = np.arange(steps)[::-1] * diffusion_steps // steps  # e.g. 90, 80, .., 0
+    following = np.append(alpha_bar[k[1:]], 1.0)  # abar = 1 after the last step: no noise left
     tables = (alpha_bar[k], 1.0 - alpha_bar[k], following, 1.0 - following)
     return DdimTable(k.astype(np.int32), *(np.sqrt(table).astype(np.float32) for table in tables))
 
@@ -79,6 +79,7 @@ def _beta_and_alpha_bar(steps: int) -> tuple[np.ndarray, np.ndarray]:
     """Returns float64 `[K]` each."""
     if steps < 1:
         raise ValueError(f"steps: expected at least 1 diffusion step, got {steps}")
+    # abar(t) at the K + 1 ends of the steps; beta_k = 1 - abar(k + 1) / abar(k).
     cosines = np.cos((np.arange(steps + 1) / steps + 0.008) / 1.008 * math.pi / 2) ** 2
     beta = np.minimum(1.0 - cosines[1:] / cosines[:-1], 0.999)
-    return beta, np.cumprod(1.0 - beta)
+    return beta, np.cumprod(1.0 - beta)  # abar_k = prod (1 - beta_i), with the cap in it

@@ -48,9 +48,10 @@ def noised(key: jax.Array, x0: jax.Array) -> NoisedShortcut:
     """
     key_flow, key_noise, key_share = jax.random.split(key, 3)
     at = flow.noised(key_flow, x0)
+    # By place, not by draw: each device has as many, so that their targets have a fixed shape.
     is_whole = jnp.arange(len(x0)) % EVERY == 0
     scale = _expand(jax.random.uniform(key_share, x0.shape[:1]), x0)
-    start = scale * jax.random.normal(key_noise, x0.shape, x0.dtype)
+    start = scale * jax.random.normal(key_noise, x0.shape, x0.dtype)  # any temperature in [0, 1]
     return NoisedShortcut(
         jnp.where(_expand(is_whole, x0), start, at.x),
         jnp.where(is_whole, WHOLE_WAY, at.time),
@@ -63,6 +64,7 @@ def loss(predict: Callable[..., jax.Array], batch: NoisedShortcut) -> jax.Array:
 
     `predict(x, time)` returns it `[B, ...]`, `predict(x, time, rows)` for some rows of the batch.
     """
+    # the teacher learns from the flow alone
     target = jax.lax.stop_gradient(targets(predict, batch))
     return jnp.mean((predict(batch.x, batch.time) - target) ** 2)
 
@@ -70,19 +72,19 @@ def loss(predict: Callable[..., jax.Array], batch: NoisedShortcut) -> jax.Array:
 def targets(predict: Callable[..., jax.Array], batch: NoisedShortcut) -> jax.Array:
     """Returns targets `[B, ...]`: the flow's velocity, or a whole path's mean velocity."""
     count = len(batch.x)
-    most = -(-count // EVERY)
+    most = -(-count // EVERY)  # rounded up
     (rows,) = jnp.nonzero(batch.time == WHOLE_WAY, size=most, fill_value=count)
     there = jnp.minimum(rows, count - 1)  # a device's part of the batch may have fewer than `most`
     start = batch.x[there]
 
     def step(x: jax.Array, time: jax.Array) -> tuple[jax.Array, None]:
         times = jnp.full(most, time, start.dtype)
-        return x - predict(x, times, there) / TEACHER_STEPS, None
+        return x - predict(x, times, there) / TEACHER_STEPS, None  # Euler: x - v dt
 
     times = np.arange(TEACHER_STEPS, 0, -1, dtype=np.float32) / TEACHER_STEPS / flow.TIME_UNIT
     # The teacher integrates the flow from t = 1 to 0; the path's mean velocity is start - end.
     end, _ = jax.lax.scan(step, start, jnp.asarray(times))
-    return batch.velocity.at[rows].set(start - end, mode="drop")
+    return batch.velocity.at[rows].set(start - end, mode="drop")  # fill values lie outside: dropped
 
 
 def sample(
@@ -106,11 +108,11 @@ def sample(
     times = [WHOLE_WAY, correct_at / flow.TIME_UNIT] if correct_at else [WHOLE_WAY]
     prepared = prepare(jnp.array(times))
     whole_way, at = (jax.tree.map(lambda leaf, i=i: leaf[i], prepared) for i in (0, -1))
-    clean = within(noise - predict(noise, whole_way), reach)
+    clean = within(noise - predict(noise, whole_way), reach)  # x_0 = x_1 - (mean velocity) * 1
     if not correct_at:
         return clean
-    x = clean + correct_at * (noise - clean)
-    return within(x - correct_at * predict(x, at), reach)
+    x = clean + correct_at * (noise - clean)  # noised to t again, with the same noise
+    return within(x - correct_at * predict(x, at), reach)  # x_0 = x_t - t v(x_t, t)
 
 
 def _expand(numbers: jax.Array, x: jax.Array) -> jax.Array:

@@ -61,7 +61,7 @@ class Layer(nn.Module):
     def __call__(self, x: jax.Array, others: jax.Array | None = None) -> jax.Array:
         """Maps `[B, L, C] -> [B, L, C]`, in `dtype`; `others` `[B, N, C]`."""
         h = self._normalised(x)
-        x = x + self._attention("attend_itself")(h, h)
+        x = x + self._attention("attend_itself")(h, h)  # pre-norm: the residual path stays linear
         if others is not None:
             x = x + self._attention("attend_others")(self._normalised(x), others)
         h = nn.relu(layers.Dense(self.mlp, name="widen")(self._normalised(x)))
@@ -98,11 +98,13 @@ class StyleEncoder(nn.Module):
         """Returns the style of sequences `[B, H, D]`, observed with `state` `[B, S]`."""
         actions = layers.Dense(self.width, name="actions")(x0.astype(self.dtype))
         now = layers.Dense(self.width, name="state")(state.astype(self.dtype))[:, None]
-        first = self.param("first", _start, (1, self.width)).astype(self.dtype)
+        first = self.param("first", _start, (1, self.width)).astype(self.dtype)  # [CLS]: reads all
         x = jnp.concatenate([jnp.broadcast_to(first, now.shape), now, actions], axis=1)
+        # Attention does not know the order of tokens.
         x = _placed(self, x)
         for _ in range(self.layers):
             x = Layer(self.heads, self.mlp, self.dtype)(x)
+        # mu, log s^2
         outputs = layers.Dense(2 * self.features, name="out")(x[:, 0].astype(jnp.float32))
         return Style(*jnp.split(outputs, 2, axis=-1))
 
@@ -154,10 +156,11 @@ class Decoder(nn.Module):
         tokens = _placed(self, tokens)
         for _ in range(self.encoder_layers):
             tokens = Layer(self.heads, self.mlp, self.dtype)(tokens)
+        # One learned query a future step: all H actions come out at once, without a causal mask.
         queries = self.param("queries", _start, (self.horizon, self.width)).astype(self.dtype)
         x = jnp.broadcast_to(queries, (len(z), *queries.shape))
         for _ in range(self.decoder_layers):
-            x = Layer(self.heads, self.mlp, self.dtype)(x, tokens)
+            x = Layer(self.heads, self.mlp, self.dtype)(x, tokens)  # queries attend to observations
         x = nn.LayerNorm()(x.astype(jnp.float32))
         return layers.Dense(self.action_dim, name="out")(x)
 

@@ -36,9 +36,10 @@ class ResidualBlock(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array, film: jax.Array) -> jax.Array:
         """Maps `x` `[B, L, C]`, `film` `[B, 2 features]` (scale, bias) -> `[B, L, features]`."""
+        # [B, 1, features]: same for all steps
         scale, bias = jnp.split(film[:, None, :], 2, axis=-1)
         h = ConvBlock(self.features, self.kernel_size, self.groups)(x)
-        h = ConvBlock(self.features, self.kernel_size, self.groups)(scale * h + bias)
+        h = ConvBlock(self.features, self.kernel_size, self.groups)(scale * h + bias)  # FiLM
         skip = x if x.shape[-1] == self.features else layers.Conv1d(self.features, 1)(x)
         return h + skip
 
@@ -95,8 +96,9 @@ class ConditionalUnet1D(nn.Module):
 
         self.time_in = layers.Dense(4 * self.time_dim)
         self.time_out = layers.Dense(self.time_dim)
+        # two blocks a level
         self.film_widths = [c for c in (*widths, widths[-1], *upward) for _ in range(2)]
-        size = 2 * sum(self.film_widths)
+        size = 2 * sum(self.film_widths)  # scale and bias of every channel
         init = layers.uniform_init(self.time_dim + self.cond_dim)
         self.film_time = self.param("film_time", init, (self.time_dim, size))
         self.film_cond = self.param("film_cond", init, (self.cond_dim, size))
@@ -111,6 +113,7 @@ class ConditionalUnet1D(nn.Module):
         """Returns the condition's part of every FiLM: `[B, C] -> float32 [B, F]`."""
         if cond.shape[-1] != self.cond_dim:
             raise ValueError(f"cond: expected [B, {self.cond_dim}], got {cond.shape}")
+        # Mish acts entry by entry, so the part of the condition splits off (module docstring).
         active = layers.mish(cond.astype(self.dtype))
         film = _matmul_f32(active, self.film_cond)
         return film + layers.spread(self.film_bias, film.shape)
@@ -119,10 +122,11 @@ class ConditionalUnet1D(nn.Module):
         """Returns the diffusion step's part of every FiLM: int `[...] -> float32 [..., F]`."""
         half = self.time_dim // 2
         fall = -math.log(10_000.0) / max(half - 1, 1)
-        frequency = jnp.exp(jnp.arange(half, dtype=jnp.float32) * fall)
+        frequency = jnp.exp(jnp.arange(half, dtype=jnp.float32) * fall)  # 1 .. 1e-4, geometric
         angle = jnp.asarray(k, jnp.float32)[..., None] * frequency.reshape(
             (1,) * jnp.ndim(k) + (-1,)
         )
+        # [.., time_dim]
         wave = jnp.concatenate([jnp.sin(angle), jnp.cos(angle)], -1).astype(self.dtype)
         embedding = self.time_out(layers.mish(self.time_in(wave)))
         return _matmul_f32(layers.mish(embedding), self.film_time)
@@ -140,15 +144,16 @@ class ConditionalUnet1D(nn.Module):
         skips = []
         for level, (first, second) in enumerate(self.down):
             x = second(first(x, next(films)), next(films))
+            # Kept at every level: the upward half gets back the detail that halving loses.
             skips.append(x)
             if level < len(self.halve):
                 x = self.halve[level](x)
         for block in self.middle:
             x = block(x, next(films))
         for (first, second), double in zip(self.up, self.double, strict=True):
-            x = jnp.concatenate([x, skips.pop()], -1)
+            x = jnp.concatenate([x, skips.pop()], -1)  # [B, L, 2 C]
             x = double(second(first(x, next(films)), next(films)))
-        return self.out(self.last(x)).astype(jnp.float32)
+        return self.out(self.last(x)).astype(jnp.float32)  # eps or v, in the unit of x
 
     def _block(self, features: int) -> nn.Module:
         return self.residual_block(features, self.kernel_size, self.groups)

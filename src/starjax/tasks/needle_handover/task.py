@@ -11,8 +11,7 @@ from starjax import rcm
 from starjax.core.types import Pose
 from starjax.sim import bodies, endoscope_camera, workspaces
 from starjax.sim.task import SimReadings, TaskStatus
-from starjax.tasks import two_arms
-from starjax.tasks.needle_handover import text
+from starjax.tasks import rewards, two_arms
 from starjax.tasks.needle_pick import task as single
 
 # Start of the tips, and waiting position of an idle one: near the middle, so the shafts lean apart.
@@ -110,22 +109,35 @@ def status(
     is_alone = measurements.touch[1] & ~measurements.touch[0]
     success_now = measurements.passed & is_up & is_alone & (measurements.slip < single.SLIP)
     lost = measurements.lifted & (measurements.untouched > DROPPED_STEPS)
-    stage = jnp.where(measurements.touch[0], 1, 0)
-    stage = jnp.where(measurements.lifted, 2, stage)
-    stage = jnp.where(measurements.passed, 3, stage)
-    stage = jnp.where(success_now, 4, stage).astype(jnp.int32)
-    to_giver, to_taker = jnp.linalg.norm(measurements.needle.p - measurements.tips, axis=-1)
-    left = jnp.stack([to_giver, to_giver, to_taker, to_taker, to_taker])[stage]
-    reward = (stage + jnp.exp(-left / single.NEAR)) / len(STAGES)
-    return TaskStatus(
-        success_now, measurements.passed, lost, stage, jnp.where(success_now, 1.0, reward)
+    stage = rewards.last_reached(
+        measurements.touch[0], measurements.lifted, measurements.passed, success_now
     )
+    to_giver, to_taker = jnp.linalg.norm(measurements.needle.p - measurements.tips, axis=-1)
+    terms = {
+        "approach": rewards.nearness(to_giver, single.NEAR),
+        "lifted": rewards.nearness(to_taker, single.NEAR),
+    }
+    reward = rewards.staged(STAGES, terms, stage, success_now)
+    return TaskStatus(success_now, measurements.passed, lost, stage, reward)
 
 
 def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
     """Returns `[..., 15]`: as in `needle_pick` from each tip, and from tip to tip."""
     parts = [single.relative(state, tips[..., a : a + 1, :]) for a in range(2)]
     return jnp.concatenate([*parts, (tips[..., 1, :] - tips[..., 0, :]) / single.NEAR], axis=-1)
+
+
+TEXT = single.TEXT._replace(
+    title="needle hand-over",
+    done="handed the needle over in the air",
+    strict="lifted by one tool, taken over in the air, and held for 2 s by the other alone without "
+    "slipping by more than 0.5 mm, in time",
+    loose="the other tool alone held the needle in the air, slipping or not",
+    nearly="needle taken over, but it slipped or was not held for 2 s",
+    collided="pressed jaws or shaft into the foam, or shafts or arms touched",
+    goal="the needle must be handed over",
+    lost="the needle was dropped",
+)
 
 
 TASK = single.TASK._replace(
@@ -135,7 +147,7 @@ TASK = single.TASK._replace(
     cameras=("side", endoscope_camera.NAME),
     time_limit_s=60.0,
     stages=STAGES,
-    text=text.TEXT,
+    text=TEXT,
     expert_version=2,
     experts={
         "default": "starjax.tasks.needle_handover.expert:AGENT",

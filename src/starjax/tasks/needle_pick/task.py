@@ -13,8 +13,8 @@ import numpy as np
 from starjax import rcm
 from starjax.core.types import Pose
 from starjax.sim import bodies, endoscope_camera, workspaces
-from starjax.sim.task import Field, SimReadings, Slot, Task, TaskStatus
-from starjax.tasks.needle_pick import text
+from starjax.sim.task import Field, Outline, SimReadings, Slot, Task, TaskStatus, TaskText
+from starjax.tasks import outlines
 
 if TYPE_CHECKING:  # a robot loads tasks without the simulator
     import mujoco
@@ -191,6 +191,24 @@ def is_sound(bound: NeedleBound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     return bodies.is_sound(qpos, qvel, bound.needle, bound.dof, MAX_SPEED, MAX_DISTANCE)
 
 
+TEXT = TaskText(
+    title="needle pick",
+    done="picked up the needle",
+    strict="lifted by 20 mm and held for 2 s without slipping by more than 0.5 mm, its point free, "
+    "in time",
+    loose="the needle was lifted by 20 mm, held or thrown",
+    nearly="needle lifted, but it slipped or was not held for 2 s",
+    collided="pressed jaws or shaft into the foam",
+    ground="the foam",
+    goal="the needle must be lifted",
+)
+
+
+def outline(m: "mujoco.MjModel") -> Outline:
+    """Returns the foam's rectangle."""
+    return Outline((outlines.rectangle(m, "foam"),), ())
+
+
 TASK = Task(
     name="needle_pick",
     mjcf="tasks/needle_pick/needle_pick.xml",
@@ -200,7 +218,7 @@ TASK = Task(
     settle_steps=SETTLE_STEPS,
     fields=(Field("needle.p", 3, "point"), Field("needle.R", 6, "rot6d")),
     stages=STAGES,
-    text=text.TEXT,
+    text=TEXT,
     expert_version=2,
     experts={"default": "starjax.tasks.needle_pick.expert:AGENT"},
     graspable=tuple(f"wire{k}{side}" for k in range(SEGMENTS) for side in "ab"),
@@ -214,6 +232,6 @@ TASK = Task(
     relative=relative,
     floor=FLOOR,
     is_sound=is_sound,
-    outline=text.outline,
+    outline=outline,
     endoscope=workspaces.BOARD_ENDOSCOPE,
 )

@@ -15,6 +15,7 @@ from starjax import rcm
 from starjax.core.types import Pose
 from starjax.sim import bodies, endoscope_camera, workspaces
 from starjax.sim.task import Capsules, Field, SimReadings, Slot, Task, TaskStatus
+from starjax.tasks import rewards
 from starjax.tasks.peg_transfer import text
 
 if TYPE_CHECKING:  # a robot loads tasks without the simulator
@@ -160,17 +161,16 @@ def status(bound: PegBound, layout: PegLayout, measurements: PegMeasurements) ->
     threaded = is_threaded(block, peg)
     success_now = threaded & is_at_rest(measurements.velocity) & ~measurements.touch
     near, lifted = is_near(block, peg), block.p[2] > RIM_HEIGHT + LIFTED
-    stage = jnp.where(measurements.touch, 1, 0)
-    stage = jnp.where(measurements.touch & lifted, 2, stage)
     over = jnp.sum((block.p[:2] - peg) ** 2) < LOOSE_XY**2
-    stage = jnp.where(over & (measurements.touch | near), 3, stage)
-    stage = jnp.where(threaded, 4, stage)
-    stage = jnp.where(success_now, 5, stage).astype(jnp.int32)
-    to_block = jnp.linalg.norm(block.p - measurements.tip)
-    to_target = jnp.linalg.norm(block.p[:2] - peg)
-    left = jnp.where(stage == 0, to_block, to_target)
-    fraction = jnp.where(success_now, 1.0, jnp.exp(-left / NEAR))
-    reward = jnp.where(success_now, 1.0, (stage + fraction) / len(STAGES))
+    touch = measurements.touch
+    stage = rewards.last_reached(
+        touch, touch & lifted, over & (touch | near), threaded, success_now
+    )
+    terms = {
+        "approach": rewards.nearness(jnp.linalg.norm(block.p - measurements.tip), NEAR),
+        "grasped": rewards.nearness(jnp.linalg.norm(block.p[:2] - peg), NEAR),
+    }
+    reward = rewards.staged(STAGES, terms, stage, success_now)
     return TaskStatus(success_now, near, jnp.zeros((), bool), stage, reward)
 
 

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from starjax.core.types import Pose
 from starjax.sim import bodies, endoscope_camera, workspaces
 from starjax.sim.task import SimReadings, TaskStatus
-from starjax.tasks import two_arms
+from starjax.tasks import rewards, two_arms
 from starjax.tasks.peg_transfer import task as single
-from starjax.tasks.peg_transfer_bimanual import text
+from starjax.tasks.peg_transfer import text
 
 # Start of the tips, and waiting position of an idle one: the shafts lean apart.
 PARK = ((-0.02, 0.0, 0.065), (0.02, 0.0, 0.065))
@@ -101,17 +101,17 @@ def status(
     is_left = single.is_at_rest(measurements.velocity) & ~measurements.touch.any()
     success_now = threaded & measurements.passed & is_left
     lost = measurements.lifted & (measurements.untouched > DROPPED_STEPS) & ~threaded
-    stage = jnp.where(measurements.touch[0], 1, 0)
-    stage = jnp.where(measurements.lifted, 2, stage)
-    stage = jnp.where(measurements.passed, 3, stage)
-    stage = jnp.where(measurements.passed & near, 4, stage)
-    stage = jnp.where(measurements.passed & threaded, 5, stage)
-    stage = jnp.where(success_now, 6, stage).astype(jnp.int32)
-    to_giver = jnp.linalg.norm(block.p - measurements.tips[0])
-    to_taker = jnp.linalg.norm(block.p - measurements.tips[1])
-    to_peg = jnp.linalg.norm(block.p[:2] - peg)
-    left = jnp.stack([to_giver, to_giver, to_taker, to_peg, to_peg, to_peg, to_peg])[stage]
-    reward = jnp.where(success_now, 1.0, (stage + jnp.exp(-left / single.NEAR)) / len(STAGES))
+    lifted, passed = measurements.lifted, measurements.passed
+    stage = rewards.last_reached(
+        measurements.touch[0], lifted, passed, passed & near, passed & threaded, success_now
+    )
+    to_giver, to_taker = jnp.linalg.norm(block.p - measurements.tips, axis=-1)
+    terms = {
+        "approach": rewards.nearness(to_giver, single.NEAR),
+        "lifted": rewards.nearness(to_taker, single.NEAR),
+        "passed": rewards.nearness(jnp.linalg.norm(block.p[:2] - peg), single.NEAR),
+    }
+    reward = rewards.staged(STAGES, terms, stage, success_now)
     return TaskStatus(success_now, near, lost, stage, reward)
 
 
@@ -121,13 +121,24 @@ def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
     return jnp.concatenate([*parts, (tips[..., 1, :] - tips[..., 0, :]) / single.NEAR], axis=-1)
 
 
+TEXT = text.TEXT._replace(
+    title="bimanual peg transfer",
+    done="handed the block over in the air and put it on its peg",
+    strict="lifted by one tool, passed in the air, threaded on the target peg by the other, "
+    "released and at rest, in time",
+    nearly="block at its peg, but not passed in the air, or not threaded, released and at rest",
+    collided="touched the board, a peg or the block with a shaft or an arm, or the arms met",
+    lost="the block was dropped",
+)
+
+
 TASK = single.TASK._replace(
     name="peg_transfer_bimanual",
     mjcf="tasks/peg_transfer_bimanual/peg_transfer_bimanual.xml",
     slots=two_arms.SLOTS,
     cameras=("side", endoscope_camera.NAME),
     stages=STAGES,
-    text=text.TEXT,
+    text=TEXT,
     expert_version=2,
     experts={"default": "starjax.tasks.peg_transfer_bimanual.expert:AGENT"},
     sample=sample,

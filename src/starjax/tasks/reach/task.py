@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax.sim import endoscope_camera, workspaces
-from starjax.sim.task import Capsules, Field, SimReadings, Slot, Task, TaskStatus
-from starjax.tasks.reach import text
+from starjax.sim.task import Capsules, Field, Outline, SimReadings, Slot, Task, TaskStatus, TaskText
+from starjax.tasks import outlines, rewards
 
 if TYPE_CHECKING:  # a robot loads tasks without the simulator
     import mujoco
@@ -95,7 +95,8 @@ def status(bound: ReachBound, layout: ReachLayout, measurements: ReachMeasuremen
     at_mark, near = off < TOLERANCE, off < LOOSE
     success_now = at_mark & (measurements.speed < REST_SPEED)
     stage = near.astype(jnp.int32) + at_mark + success_now
-    reward = jnp.where(success_now, 1.0, (stage + jnp.exp(-off / NEAR)) / len(STAGES))
+    terms = {STAGES[0]: rewards.nearness(off, NEAR)}
+    reward = rewards.staged(STAGES, terms, stage, success_now)
     return TaskStatus(success_now, near, jnp.zeros((), bool), stage, reward)
 
 
@@ -111,6 +112,25 @@ def obstacles(bound: ReachBound, layout: ReachLayout, measurements: ReachMeasure
     return Capsules(foot, marks - jnp.array([0.0, 0.0, TOLERANCE]), jnp.asarray(bound.posts))
 
 
+TEXT = TaskText(
+    title="reach",
+    done="brought the tip to the marked point",
+    strict="within 2 mm of the marked point and at rest for 1 s, in time",
+    loose="the tip was within 5 mm of the marked point, moving or not",
+    nearly="near the marked point, but not at rest on it",
+    collided="touched the pad, or a post with the shaft",
+    ground="the pad",
+    goal="the tip belongs on the coloured mark",
+)
+
+
+def outline(m: "mujoco.MjModel") -> Outline:
+    """Returns the pad's rectangle and the posts."""
+    marks = [mark.pos for mark in outlines.named(m, "mark")]
+    lines = tuple(outlines.stick(mark, mark[2]) for mark in marks)
+    return Outline((outlines.rectangle(m, "pad"),), lines)
+
+
 TASK = Task(
     name="reach",
     mjcf="tasks/reach/reach.xml",
@@ -121,7 +141,7 @@ TASK = Task(
     fields=(Field("goal.p", 3, "point"),),
     labels=("goal",),
     stages=STAGES,
-    text=text.TEXT,
+    text=TEXT,
     expert_version=2,
     experts={"default": "starjax.tasks.reach.expert:AGENT"},
     graspable=(),
@@ -135,6 +155,6 @@ TASK = Task(
     label=lambda layout: {"goal": layout.goal},
     colours=colours,
     obstacles=obstacles,
-    outline=text.outline,
+    outline=outline,
     endoscope=workspaces.BOARD_ENDOSCOPE,
 )

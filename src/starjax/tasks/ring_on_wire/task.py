@@ -14,10 +14,9 @@ import numpy as np
 from starjax import rcm
 from starjax.core.types import Pose
 from starjax.sim import bodies, endoscope_camera, workspaces
-from starjax.sim.task import Capsules, Field, SimReadings, Slot, Task, TaskStatus
-from starjax.tasks import outlines
+from starjax.sim.task import Capsules, Field, Outline, SimReadings, Slot, Task, TaskStatus, TaskText
+from starjax.tasks import outlines, rewards
 from starjax.tasks.peg_transfer.task import is_at_rest
-from starjax.tasks.ring_on_wire import text
 
 if TYPE_CHECKING:  # a robot loads tasks without the simulator
     import mujoco
@@ -179,14 +178,15 @@ def status(bound: RingBound, layout: RingLayout, measurements: RingMeasurements)
     hangs = at_end & (jnp.abs(raised) < HANG_TOLERANCE)
     may = measurements.rubbed <= MAY_TOUCH
     success_now = hangs & may & ~measurements.touch & is_at_rest(measurements.velocity)
-    stage = jnp.where(measurements.touch, 1, 0)
-    stage = jnp.where(measurements.touch & (raised > LIFTED), 2, stage)
-    stage = jnp.where((stage == 2) & (way > BENDS[1]), 3, stage)
-    stage = jnp.where(at_end, 4, stage)
-    stage = jnp.where(success_now, 5, stage).astype(jnp.int32)
+    touch, is_lifted = measurements.touch, measurements.touch & (raised > LIFTED)
+    is_past_bend = is_lifted & (way > BENDS[1])
+    stage = rewards.last_reached(touch, is_lifted, is_past_bend, at_end, success_now)
     to_tab = jnp.linalg.norm(p + TAB * measurements.ring.R[:, 2] - measurements.tip)
-    left = jnp.where(stage == 0, to_tab, jnp.maximum(END - way, 0.0))
-    reward = jnp.where(success_now, 1.0, (stage + jnp.exp(-left / NEAR)) / len(STAGES))
+    terms = {
+        "approach": rewards.nearness(to_tab, NEAR),
+        "grasped": rewards.nearness(jnp.maximum(END - way, 0.0), NEAR),
+    }
+    reward = rewards.staged(STAGES, terms, stage, success_now)
     return TaskStatus(success_now, at_end, ~may, stage, reward)
 
 
@@ -225,6 +225,26 @@ def is_sound(bound: RingBound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
     return bodies.is_sound(qpos, qvel, bound.ring, bound.dof, MAX_SPEED, MAX_DISTANCE)
 
 
+TEXT = TaskText(
+    title="ring on wire",
+    done="carried the ring along the wire to its end",
+    strict="at the marked end of the wire, released and at rest, having touched the bent part for "
+    "0.3 s at most, in time",
+    loose="the ring came to the marked end, however often it touched the wire",
+    nearly="ring at the marked end, but not released and at rest there",
+    collided="touched the base or the wire with the shaft or an arm",
+    ground="the base",
+    goal="the ring belongs at the marked end of the wire",
+    lost="the ring touched the bent part of the wire for longer than 0.3 s",
+)
+
+
+def outline(m: "mujoco.MjModel") -> Outline:
+    """Returns the base's rectangle and the wire."""
+    pieces = tuple(map(outlines.capsule_ends, outlines.named(m, "wire", "post")))
+    return Outline((outlines.rectangle(m, "base"),), pieces)
+
+
 TASK = Task(
     name="ring_on_wire",
     mjcf="tasks/ring_on_wire/ring_on_wire.xml",
@@ -239,7 +259,7 @@ TASK = Task(
     ),
     labels=("start",),
     stages=STAGES,
-    text=text.TEXT,
+    text=TEXT,
     expert_version=2,
     experts={"default": "starjax.tasks.ring_on_wire.expert:AGENT"},
     graspable=("tab0", "tab1"),
@@ -255,6 +275,6 @@ TASK = Task(
     colours=colours,
     obstacles=obstacles,
     is_sound=is_sound,
-    outline=text.outline,
+    outline=outline,
     endoscope=workspaces.WIRE_ENDOSCOPE,
 )

@@ -13,10 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
-from starjax.addons.suture.needle_regrasp import text
 from starjax.core.types import Pose
 from starjax.sim import bodies, endoscope_camera, workspaces
-from starjax.sim.task import SimReadings, Slot, Task, TaskStatus
+from starjax.sim.task import Outline, SimReadings, Slot, Task, TaskStatus, TaskText
+from starjax.tasks import outlines
 from starjax.tasks.needle_pick import task as pick
 
 if TYPE_CHECKING:  # a robot loads tasks without the simulator
@@ -207,6 +207,24 @@ def is_sound(bound: RegraspBound, qpos: jax.Array, qvel: jax.Array) -> jax.Array
     return pick.is_sound(bound.pick, qpos, qvel)
 
 
+TEXT = TaskText(
+    title="needle regrasp",
+    done="took the tilted needle for driving",
+    strict="held a third from its swage within 0.1 of its length, square to the "
+    "jaws within 15 degrees, lifted by 20 mm for 2 s without slipping by more than 0.5 mm, in time",
+    loose="the needle was lifted by 20 mm, however it was held",
+    nearly="needle lifted, but held elsewhere, askew, with slip or not for 2 s",
+    collided="pressed jaws, palm or shaft into the table",
+    ground="the foam",
+    goal="the needle must be lifted, held a third from its swage",
+)
+
+
+def outline(m: "mujoco.MjModel") -> Outline:
+    """Returns the rectangle of the foam below the plate."""
+    return Outline((outlines.rectangle(m, "foam"),), ())
+
+
 TASK = Task(
     name="needle_regrasp",
     mjcf="tasks/needle_regrasp/needle_regrasp.xml",
@@ -216,7 +234,7 @@ TASK = Task(
     settle_steps=pick.SETTLE_STEPS,
     fields=pick.TASK.fields,
     stages=STAGES,
-    text=text.TEXT,
+    text=TEXT,
     expert_version=2,
     experts={"default": "starjax.addons.suture.needle_regrasp.expert:AGENT"},
     graspable=pick.TASK.graspable,
@@ -230,6 +248,6 @@ TASK = Task(
     relative=pick.relative,
     is_sound=is_sound,
     drive=drive,
-    outline=text.outline,
+    outline=outline,
     endoscope=workspaces.BOARD_ENDOSCOPE,
 )

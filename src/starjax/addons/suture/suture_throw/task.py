@@ -15,13 +15,21 @@ from starjax import rcm
 from starjax.addons.suture import thread
 from starjax.addons.suture.needle_drive import grasps
 from starjax.addons.suture.needle_drive import task as driven
-from starjax.addons.suture.suture_throw import text
 from starjax.addons.suture.tissue import driving
 from starjax.addons.suture.tissue import needle as needles
 from starjax.addons.suture.tissue.needle import Bite
 from starjax.core.types import Pose
 from starjax.sim import bodies
-from starjax.sim.task import CONTROL_HZ, Coupling, Field, SimReadings, StepReadings, TaskStatus
+from starjax.sim.task import (
+    CONTROL_HZ,
+    Coupling,
+    Field,
+    SimReadings,
+    StepReadings,
+    TaskStatus,
+    TaskText,
+)
+from starjax.tasks import rewards
 
 SIZE = needles.CT1
 BITES = (0.008, 0.010)  # m between the marks: the wrist turns such a bite to 6 mm of wire out
@@ -163,15 +171,8 @@ def status(bound: driven.DriveBound, layout: ThrowLayout, now: ThrowMeasurements
     is_gentle = (drive.max_force < driven.MAX_FORCE) & ~drive.collided
     is_pulled = now.is_through & drive.held & (now.pulled > PULLED)
     success_now = is_pulled & on_marks & is_gentle
-    stage = jnp.where(drive.held, 1, 0)
-    for reached, number in (
-        (drive.is_inside, 2),
-        (drive.has_exited, 3),
-        (now.by_point, 4),
-        (now.is_through, 5),
-        (success_now, 6),
-    ):
-        stage = jnp.where(reached, number, stage)
+    parts = drive.held, drive.is_inside, drive.has_exited, now.by_point, now.is_through
+    stage = rewards.last_reached(*parts, success_now)
     goals = jnp.stack([drive.tip - drive.needle.p, drive.point - layout.bite.entry])
     near = jnp.exp(-jnp.linalg.norm(goals, axis=-1) / driven.NEAR)
     share = jnp.where(stage < 2, near[jnp.minimum(stage, 1)], 0.0)
@@ -180,7 +181,7 @@ def status(bound: driven.DriveBound, layout: ThrowLayout, now: ThrowMeasurements
     share = jnp.where(now.is_through, jnp.clip(now.pulled / PULLED, 0.0, 1.0), share)
     reward = jnp.where(success_now, 1.0, (stage + 0.9 * share) / (len(STAGES) - 1))
     lost = ~drive.held & ~now.in_block & ~drive.is_inside
-    return TaskStatus(success_now, now.is_through, lost, stage.astype(jnp.int32), reward)
+    return TaskStatus(success_now, now.is_through, lost, stage, reward)
 
 
 def state(bound: driven.DriveBound, layout: ThrowLayout, now: ThrowMeasurements) -> jax.Array:
@@ -205,6 +206,21 @@ def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
     return jnp.concatenate([driven.relative(state, tips), *(x / driven.NEAR for x in parts)], -1)
 
 
+TEXT = TaskText(
+    title="suture throw",
+    done="threw the suture",
+    strict="in at one mark and out at the other within 1 mm, with at most 0.4 N across the hole, "
+    "needle taken out by its point, 50 mm of thread pulled through, nothing touched by shaft or "
+    "wrist, in time",
+    loose="the whole needle passed the pad",
+    nearly="needle passed through, but off a mark, with force, a collision or too little thread",
+    collided="pressed the wrist or the shaft into the pad",
+    ground="the pad",
+    goal="the needle goes in at the dark mark and out at the blue one",
+    lost="the needle was dropped",
+)
+
+
 TASK = driven.TASK._replace(
     name="suture_throw",
     mjcf="tasks/suture_throw/suture_throw.xml",
@@ -212,7 +228,7 @@ TASK = driven.TASK._replace(
     settle_steps=SETTLE_STEPS,
     fields=(*driven.TASK.fields, Field("through", 1, "unit"), Field("pulled", 1, "unit")),
     stages=STAGES,
-    text=text.TEXT,
+    text=TEXT,
     expert_version=2,
     experts={"default": "starjax.addons.suture.suture_throw.expert:AGENT"},
     bind=partial(driven.bind, SIZE),

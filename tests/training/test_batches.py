@@ -11,9 +11,8 @@ import pytest
 
 from starjax.core import config
 from starjax.data import windows
-from starjax.training import devices, prefetch, state
-from starjax.training.sharding import StateLayout
-from starjax.training.step import Setup
+from starjax.training import batches, devices, state
+from starjax.training.sharding import Setup, StateLayout
 
 NOTHING: Any = None
 SETUP = Setup(
@@ -26,10 +25,10 @@ SETUP = Setup(
 
 
 def test_frames_follow_the_step_from_wherever_it_begins(monkeypatch):
-    monkeypatch.setattr(prefetch, "_CHUNK", 4)  # several of them in ten steps
+    monkeypatch.setattr(batches, "_CHUNK", 4)  # several of them in ten steps
     dataset = jax.tree.map(np.asarray, fakes.dataset(seed=0, demos=2, length=20))
     frames, key, first = np.arange(40), jax.random.key(3), 3
-    stream = prefetch.batches(SETUP, dataset, frames, key, first)
+    stream = batches.gathered(SETUP, dataset, frames, key, first)
     for number in range(first, first + 10):
         drawn = windows.sample_frames(state.step_keys(key, number).batch, jnp.asarray(frames), 16)
         wanted = windows.gather(
@@ -45,10 +44,10 @@ def test_a_closed_feed_gathers_nothing_more(monkeypatch):
     monkeypatch.setattr(
         windows, "gather", lambda *given: gathered.append(time.sleep(0.02)) or gather(*given)
     )
-    stream = prefetch.batches(SETUP, dataset, np.arange(40), jax.random.key(3), 0)
+    stream = batches.gathered(SETUP, dataset, np.arange(40), jax.random.key(3), 0)
     next(stream)
     stream.close()
-    assert len(gathered) < prefetch._CHUNK // 2
+    assert len(gathered) < batches._CHUNK // 2
 
 
 def test_a_fault_of_the_thread_is_raised_where_the_batch_is_asked_for(monkeypatch):
@@ -57,6 +56,6 @@ def test_a_fault_of_the_thread_is_raised_where_the_batch_is_asked_for(monkeypatc
 
     monkeypatch.setattr(windows, "gather", fail)
     dataset = jax.tree.map(np.asarray, fakes.dataset(seed=0, demos=2, length=20))
-    stream = prefetch.batches(SETUP, dataset, np.arange(40), jax.random.key(3), 0)
+    stream = batches.gathered(SETUP, dataset, np.arange(40), jax.random.key(3), 0)
     with pytest.raises(OSError, match="disk"):
         next(stream)
