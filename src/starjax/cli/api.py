@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from starjax.cli import folders, pipeline
+from starjax.cli import folders, pipeline, session
 from starjax.core import errors
 from starjax.core.config import RunConfig
 from starjax.evaluation import evaluate as evaluation
@@ -55,6 +55,7 @@ def train(settings: RunConfig, folder: str | Path) -> Path:
       the policy's file.
     """
     settings = dataclasses.replace(settings, out=str(folder))
+    session.start_run(settings)
     pipeline.run(settings, ("collect", "train"), "starjax.train")
     return folders.weights(Path(folder), settings.method)
 

@@ -1,7 +1,4 @@
-"""Demonstrations of a run: their directory, their collection and the training dataset.
-
-Modules that import jax are imported inside functions, after XLA's flags are set.
-"""
+"""Demonstrations of a run: their directory, their collection and the training dataset."""
 
 import functools
 import itertools
@@ -9,10 +6,24 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
+import numpy as np
+
 from starjax.cli import messages, stage_times
 from starjax.core import config as config_lib
 from starjax.core import errors, sources
-from starjax.runtime import hub
+from starjax.data import demos, redraw, schema, store, windows
+from starjax.data import load as loading
+from starjax.evaluation.disturbances import DISTURBANCES, base, parse_levels
+from starjax.rollouts import agent, episodes, placement, sharing, success_quota, trocars
+from starjax.runtime import hub, precompile, processes
+from starjax.sim import env as sim_env
+from starjax.sim import registries, task_draws
+from starjax.sim.state import Env
+from starjax.sim.task import Task
+from starjax.training import encoder as encoders
+from starjax.training import frozen, randomise
+from starjax.training.encoder import Encoder
 
 _FROM, _RANDOMISE = "demos.from_", "demos.randomise"
 
@@ -31,17 +42,11 @@ class DemosWork(NamedTuple):
     precompile: Callable[[], None] = lambda: None
 
 
-def plan(config: config_lib.RunConfig, env: Any, share: Any) -> DemosWork:
+def plan(config: config_lib.RunConfig, env: Env, share: sharing.Share) -> DemosWork:
     """Plans the demonstrations of a run; `share` is the run's, because all processes collect."""
     if config.demos.from_:
         root = given(config, env)
         return DemosWork(root, lambda: messages.stage("collect", f"nothing, from {root}"))
-    from starjax.data import demos, schema, store
-    from starjax.rollouts import agent, placement, success_quota, trocars
-    from starjax.runtime import precompile, processes
-    from starjax.sim import env as sim_env
-    from starjax.sim import registries, task_draws
-
     env, max_levels, disturbances = randomised(config, env)
     if config.policy.observation == "image":
         env = sim_env.without_images(env)  # training draws them: collecting waits for no camera
@@ -112,13 +117,11 @@ def plan(config: config_lib.RunConfig, env: Any, share: Any) -> DemosWork:
     return DemosWork(root, collect, prepare)
 
 
-def size(config: config_lib.RunConfig, task: Any) -> tuple[int, int]:
+def size(config: config_lib.RunConfig, task: Task) -> tuple[int, int]:
     """Returns the number of demonstrations that are collected, and the frames to have room for.
 
     Both are 0 for a dataset that is given.
     """
-    from starjax.data import demos
-
     if config.demos.from_:
         return 0, 0
     count = config.demos.per_trocar * len(task.is_seen[: config.demos.seen_trocars])
@@ -126,7 +129,7 @@ def size(config: config_lib.RunConfig, task: Any) -> tuple[int, int]:
 
 
 def randomised(
-    config: config_lib.RunConfig, env: Any
+    config: config_lib.RunConfig, env: Env
 ) -> tuple[Any, dict[str, float], tuple[sources.Identity, ...]]:
     """Returns the environment for recording demonstrations, the maximum levels of its
     disturbances as datasets hold them, and their identities.
@@ -134,8 +137,6 @@ def randomised(
     Raises:
       errors.UsageError: a disturbance of observations or of measured trocars, or no such level.
     """
-    from starjax.evaluation.disturbances import DISTURBANCES, base, parse_levels
-
     max_levels = parse_levels(_RANDOMISE, config.demos.randomise)
     for name, level in max_levels.items():
         if not _changes_demos(kind := DISTURBANCES.get(name)):
@@ -158,18 +159,12 @@ def _changes_demos(kind: Any) -> bool:
     return kind.for_demos and kind.is_of_motion
 
 
-def given(config: config_lib.RunConfig, env: Any) -> Path:
+def given(config: config_lib.RunConfig, env: Env) -> Path:
     """Returns the directory of --demos.from, if the run can train on that dataset.
 
     Raises:
       errors.UsageError: it is no dataset, of another task, or without the policy's observation.
     """
-    import numpy as np
-
-    from starjax.data import redraw, schema, store
-    from starjax.rollouts import episodes
-    from starjax.training import randomise
-
     root = hub.dataset("demos.from", config.demos.from_)
     try:
         about = store.read_description(root)
@@ -205,16 +200,13 @@ def given(config: config_lib.RunConfig, env: Any) -> Path:
 
 def load(
     config: config_lib.RunConfig,
-    env: Any,
+    env: Env,
     root: Path,
     collect: Callable[[], None],
-    encoder: Any,
-    share: Any,
+    encoder: Encoder | None,
+    share: sharing.Share,
 ) -> Any:
     """Returns the dataset to train on, with the features of a frozen encoder instead of images."""
-    from starjax.data import load as loading
-    from starjax.training import randomise
-
     complete(config, root, collect, share)
     draws = env if config.policy.observation == "image" else None
     report = messages.indented
@@ -229,15 +221,13 @@ def load(
 
 
 def complete(
-    config: config_lib.RunConfig, root: Path, collect: Callable[[], None], share: Any
+    config: config_lib.RunConfig, root: Path, collect: Callable[[], None], share: sharing.Share
 ) -> None:
     """Collects missing and damaged demonstrations.
 
     Raises:
       errors.UsageError: those of --demos.from are damaged, or none is a success.
     """
-    from starjax.data import load as loading
-    from starjax.data import store
 
     def is_whole() -> bool:
         try:
@@ -259,16 +249,14 @@ def complete(
 
 
 def with_features(
-    config: config_lib.RunConfig, env: Any, root: Path, demos: Any, encoder: Any
+    config: config_lib.RunConfig,
+    env: Env,
+    root: Path,
+    loaded: loading.Demos,
+    encoder: Encoder | None,
 ) -> Any:
-    """Returns the frames of `demos`, loaded without images, with features of a frozen encoder."""
-    import jax
-    import numpy as np
-
-    from starjax.data import load, windows
-    from starjax.training import frozen
-
-    dataset = demos.dataset
+    """Returns frames that were loaded without images, with the features of a frozen encoder."""
+    dataset = loaded.dataset
     count = int(np.sum(dataset.length))
     # A delayed window may show any frame.
     stride = 1 if config.train.randomise else config.train.window_stride
@@ -279,10 +267,10 @@ def with_features(
                 encoder,
                 config.policy,
                 root,
-                demos.digest,
+                loaded.digest,
                 count,
                 camera,
-                lambda camera=camera: load.frames(root, env)[camera],
+                lambda camera=camera: loading.frames(root, env)[camera],
                 messages.indented,
                 rows,
             )
@@ -302,7 +290,5 @@ def frozen_encoder(policy: config_lib.PolicyConfig) -> Any:
     """
     if policy.observation != "image" or not policy.encoder_weights:
         return None
-    from starjax.training import encoder
-
-    pretrained = encoder.read(policy)
+    pretrained = encoders.read(policy)
     return pretrained if policy.freeze_encoder else None

@@ -12,7 +12,7 @@ import re
 import shlex
 import sys
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, NoReturn, TypeVar
 
 import tyro
@@ -69,7 +69,6 @@ def parse(
     argv: Sequence[str],
     description: str,
     default: SettingsT | None = None,
-    renamed: Mapping[str, str] = {},
 ) -> SettingsT:
     """Returns the settings of a command line.
 
@@ -79,14 +78,13 @@ def parse(
       argv: words after the subcommand.
       description: text above the flags in `--help`.
       default: values of fields that `argv` does not set; by default those of `settings`.
-      renamed: flags of the previous release -> flags of this one.
 
     Raises:
       errors.UsageError: a flag is unknown, or its value has the wrong type or range.
     """
     if argv is DECLARE:
         raise Declared(settings, default)
-    words = [_expanded(_current(word, renamed)) for word in argv]
+    words = [_expanded(word) for word in argv]
     cli = functools.partial(
         tyro.cli,
         settings,
@@ -175,15 +173,6 @@ def spelled(error: errors.UsageError) -> str:
 def typed(name: str, argv: Sequence[str]) -> str:
     """Returns the command line, for results."""
     return shlex.join(["starjax", name, *argv])
-
-
-def _current(word: str, renamed: Mapping[str, str]) -> str:
-    """Returns a word of the command line, with this release's name if it is a renamed flag."""
-    flag_, equals, value = word.partition("=")
-    if flag_ not in renamed:
-        return word
-    errors.warn_renamed(flag_, renamed[flag_])
-    return f"{renamed[flag_]}{equals}{value}"
 
 
 def _expanded(word: str) -> str:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from starjax.cli import (
     folders,
     messages,
     plan_text,
+    policy_evaluation,
     precompile,
     scenes,
     scored,
@@ -20,9 +20,17 @@ from starjax.cli import (
 )
 from starjax.core import config as config_lib
 from starjax.core import config_json, errors, learners, methods, sources
-from starjax.runtime import files, jax_start
+from starjax.evaluation import result as results
+from starjax.policies import in_env, policy_file
+from starjax.rollouts import sharing
+from starjax.runtime import files, processes
+from starjax.runtime import precompile as background
 from starjax.runtime.signals import stop_signals
+from starjax.sim import env as envs
 from starjax.sim import registries
+from starjax.sim.state import Env
+from starjax.training import devices, loop, randomise, trackers
+from starjax.training.encoder import Encoder
 
 STAGES = messages.STAGES
 MIN_FREE_BYTES = 64 << 20  # weights and figures; demonstrations and checkpoints check their own
@@ -41,8 +49,8 @@ class RunContext:
     """
 
     config: config_lib.RunConfig
-    encoder: Any
-    share: Any
+    encoder: Encoder | None
+    share: sharing.Share
     command: str
     tracker: str = ""
 
@@ -68,10 +76,6 @@ def run(
       command: command line, for results.
       tracker: see `RunContext`.
     """
-    jax_start.announce(plan_text.headline(config), sys.stdout)
-    session.start_jax(*session.RUN_MODULES)
-    from starjax.runtime import precompile as background
-
     config = scenes.resolved(config)
     _check(config.policy, config.train, stages)
     names = methods.selected(config.method)
@@ -116,9 +120,6 @@ def _check(
     policy: config_lib.PolicyConfig, train: config_lib.TrainConfig, stages: Sequence[str]
 ) -> None:
     """Raises UsageError for settings that the devices rule out, before demonstrations begin."""
-    from starjax.runtime import processes
-    from starjax.training import devices, randomise
-
     randomise.max_levels(train, policy)
     if policy.freeze_encoder and not processes.is_alone():
         raise errors.UsageError("policy.freeze_encoder", "one process", "several")
@@ -126,21 +127,15 @@ def _check(
         devices.make_mesh(train.batch_size)
 
 
-def draw_images(config: config_lib.RunConfig, env: Any) -> Any:
+def draw_images(config: config_lib.RunConfig, env: Env) -> Any:
     """Returns the function that draws images anew in training, or None."""
-    from starjax.training import randomise
-
     names = list(randomise.max_levels(config.train))
     moves = randomise.redraws(config.train)
     return scenes.disturbable(env, names, config.policy).draw if moves else None
 
 
 def _environment(config: config_lib.RunConfig) -> Any:
-    # Here and below, modules that import jax are imported where they are used, after XLA's flags
-    # are set.
-    from starjax.sim import env
-
-    return env.for_policy(scenes.names(config.scene), config.policy)
+    return envs.for_policy(scenes.names(config.scene), config.policy)
 
 
 def _claim(work: RunContext, names: Sequence[str], demos: Path) -> None:
@@ -164,10 +159,6 @@ def _train(
     step: Callable[[], Any] | None = None,
 ) -> None:
     """Trains one set of weights; `policy.safetensors` is its last file."""
-    from starjax.policies import policy_file
-    from starjax.runtime import processes
-    from starjax.training import loop, trackers
-
     config, env, share = work.config, work.env, work.share
     folder, weights = work.out / name, folders.weights(work.out, name)
     if share.first(f"{name} was trained", weights.exists):
@@ -235,9 +226,6 @@ def _evaluate(
     work: RunContext, name: str, demos: Path, policy: Callable[[], Any] | None = None
 ) -> None:
     """Runs the closed-loop trials of one method; `result.json` is its last file."""
-    from starjax.cli import policy_evaluation
-    from starjax.policies import in_env
-
     config, env, share = _of_method(work, name), work.env, work.share
     folder, weights = work.out / name, folders.weights(work.out, name)
     if share.first(f"{name} was scored", lambda: scored.is_complete(config, folder, weights, env)):
@@ -291,7 +279,6 @@ def _timings(out: Path, name: str, demos: str) -> dict[str, float]:
 
 def _report(out: Path, names: Sequence[str]) -> None:
     """Writes the report of all methods in the directory; prints the outcome of this run."""
-    from starjax.evaluation import result
     from starjax.report import build
 
     scored = [out / name for name in methods.METHODS if (out / name / "result.json").exists()]
@@ -301,5 +288,5 @@ def _report(out: Path, names: Sequence[str]) -> None:
             page = build.build(scored, out / "report", report=messages.indented)
         except ValueError as error:  # from a damaged file, which it names
             raise errors.UsageError(str(out), "complete results", error) from error
-    results = [result.read(out / name / "result.json") for name in names]
-    print(f"\n{messages.outcome(results)}\n\nreport: {page}", flush=True)
+    read = [results.read(out / name / "result.json") for name in names]
+    print(f"\n{messages.outcome(read)}\n\nreport: {page}", flush=True)

@@ -3,22 +3,21 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import jax
+
 import starjax
 from starjax.cli import messages, presets
 from starjax.core import config as config_lib
 from starjax.core import methods
-from starjax.runtime import xla
-
-
-def headline(config: config_lib.RunConfig) -> str:
-    """Returns the first line of a run's plan; it needs no jax."""
-    return (
-        f"method {config.method}, preset {config.preset}, seed {config.seed}, folder {config.out}"
-    )
+from starjax.policies import packaged, policy_file
+from starjax.runtime import stored, xla
+from starjax.sim import registries
+from starjax.sim.task import CONTROL_HZ
+from starjax.training import devices
 
 
 def plan(config: config_lib.RunConfig, stages: Sequence[str]) -> str:
-    """Returns the plan of a run, for its start, without the headline."""
+    """Returns the plan of a run."""
     lines = [*_setting(config), _learning_from(config.demos)]
     lines += [_training(config), *_idle(config.train.batch_size)] if "train" in stages else []
     lines += [f"{_evaluation(config)}, seed {config.trial_seed}"] if "evaluate" in stages else []
@@ -52,16 +51,12 @@ def about_served(config: config_lib.RunConfig, name: str, seed: int) -> str:
 
 def _setting(config: config_lib.RunConfig) -> list[str]:
     """Returns lines with devices, scene, observation and ablations."""
-    import jax
-
-    from starjax.runtime import stored
-
-    devices, scene = jax.devices(), config.scene
+    there, scene = jax.devices(), config.scene
     programs = "found in" if stored.are_cached() else "compiled now, for minutes, and kept in"
     robots = ", ".join(f"{arm} with {tool}" for arm, tool in zip(scene.arm, scene.tool))
     parts = [_task(config).text.title, robots, ", ".join(scene.camera)]
     return [
-        f"  device          {len(devices)} x {devices[0].device_kind}, {xla.cores()} CPU cores",
+        f"  device          {len(there)} x {there[0].device_kind}, {xla.cores()} CPU cores",
         f"  programs        {programs} {xla.compilation_cache()}",
         f"  scene           {'; '.join(filter(None, parts))}",
         *_seeing(config),
@@ -70,8 +65,6 @@ def _setting(config: config_lib.RunConfig) -> list[str]:
 
 
 def _task(config: config_lib.RunConfig) -> Any:
-    from starjax.sim import registries
-
     return registries.tasks.get(config.scene.task)
 
 
@@ -93,10 +86,6 @@ def _training(config: config_lib.RunConfig) -> str:
 
 def _idle(batch_size: int) -> list[str]:
     """Returns a line if some devices cannot share a batch."""
-    import jax
-
-    from starjax.training import devices
-
     used, there = devices.make_mesh(batch_size).size, jax.device_count()
     if used == there:
         return []
@@ -104,8 +93,6 @@ def _idle(batch_size: int) -> list[str]:
 
 
 def _evaluation(config: config_lib.RunConfig) -> str:
-    from starjax.sim.task import CONTROL_HZ
-
     task, trials = _task(config), config.eval.trials
     trocars, limit = len(task.is_seen), f"at most {config.eval.time_limit_s:g} s each"
     if config.eval.time_limit_s < (longest := task.least_steps / CONTROL_HZ):
@@ -116,8 +103,6 @@ def _evaluation(config: config_lib.RunConfig) -> str:
 
 def _time(config: config_lib.RunConfig, stages: Sequence[str]) -> list[str]:
     """Returns a line with the measured time of a preset, if the run does not change it."""
-    import jax
-
     timing = presets.TIMINGS.get(config.preset)
     if (
         timing is None
@@ -172,8 +157,6 @@ def encoder(config: config_lib.RunConfig) -> str:
 
 def _scene_of(encoder_weights: str) -> Any:
     """Returns the scene of an encoder's training, None without a readable policy file."""
-    from starjax.policies import packaged, policy_file
-
     try:
         return policy_file.load(packaged.find_encoder("", encoder_weights)).scene
     except (OSError, ValueError):

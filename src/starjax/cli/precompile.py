@@ -3,8 +3,17 @@
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import jax
+
+from starjax.cli import demonstrations, policy_evaluation
 from starjax.core import config as config_lib
 from starjax.core import methods
+from starjax.data import redraw
+from starjax.runtime import precompile
+from starjax.sim.state import Env
+from starjax.training import frozen
+from starjax.training import precompile as training
+from starjax.training.encoder import Encoder
 
 
 class Precompiled(NamedTuple):
@@ -22,7 +31,11 @@ class Precompiled(NamedTuple):
 
 
 def begin(
-    config: config_lib.RunConfig, name: str, stages: Sequence[str], env: Any, encoder: Any
+    config: config_lib.RunConfig,
+    name: str,
+    stages: Sequence[str],
+    env: Env,
+    encoder: Encoder | None,
 ) -> Precompiled:
     """Begins to compile the features and the training of a method, then its trials and inference.
 
@@ -33,14 +46,7 @@ def begin(
       env: environment with the observation of the training.
       encoder: the frozen encoder, or None.
     """
-    import jax
-
-    from starjax.cli import demonstrations, policy_evaluation
-    from starjax.data import redraw
     from starjax.report import scene_view, video
-    from starjax.runtime import precompile
-    from starjax.training import frozen
-    from starjax.training import precompile as training
 
     if "train" not in stages or len(jax.devices()) > 1:
         return Precompiled()

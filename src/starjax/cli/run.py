@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from starjax.cli import options, run_settings
+from starjax.cli import options, run_settings, session
 
 DESCRIPTION = """Collects demonstrations, trains, evaluates and writes the report.
 
@@ -44,7 +44,8 @@ def train(argv: Sequence[str]) -> int:
 
 def _run(name: str, argv: Sequence[str], description: str, stages: Sequence[str]) -> int:
     config = run_settings.parse(name, argv, description)
-    from starjax.cli import pipeline  # after the settings: mistakes need not wait for jax
+    session.start_run(config)
+    from starjax.cli import pipeline  # it imports jax, for which mistakes do not wait
 
     pipeline.run(config, stages, options.typed(name, argv), run_settings.tracker(argv))
     return 0

@@ -7,18 +7,18 @@ from typing import Any
 
 from starjax.core import config as config_lib
 from starjax.core import config_json, errors, sources
+from starjax.evaluation import result
 from starjax.runtime import files
+from starjax.sim.state import Env
 
 
-def is_complete(config: config_lib.RunConfig, folder: Path, weights: Path, env: Any) -> bool:
+def is_complete(config: config_lib.RunConfig, folder: Path, weights: Path, env: Env) -> bool:
     """Returns True if the result of a method is complete.
 
     Raises:
       errors.UsageError: fewer trials would replace it, or a part's code is another under an equal
         version.
     """
-    from starjax.evaluation import result
-
     scored = _read(folder, files.sha256(weights))
     now = sources.record(result.parts_of(env.names, config_json.as_json(config)))
     is_current = scored and scored.about.get("parts", now["parts"]) == now["parts"]
@@ -38,8 +38,6 @@ def is_complete(config: config_lib.RunConfig, folder: Path, weights: Path, env: 
 
 def _read(folder: Path, weights: str) -> Any:
     """Returns the result of these weights, None if it is missing or damaged."""
-    from starjax.evaluation import result
-
     try:
         scored = result.read(folder / "result.json")
     except (FileNotFoundError, ValueError):  # damaged: made again

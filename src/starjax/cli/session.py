@@ -4,18 +4,20 @@ Imports jax and numpy only when a session starts: `--help` and mistakes come bef
 """
 
 import contextlib
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
 from starjax.cli import options
+from starjax.core import config as config_lib
 from starjax.runtime import gpu, jax_start, xla
 
 SettingsT = TypeVar("SettingsT")
 
 # Modules that take seconds to import, in the meantime of a GPU's start.
-RUN_MODULES = ("starjax.sim.env", "starjax.training.loop")
+RUN_MODULES = ("starjax.cli.pipeline",)
 POLICY_MODULES = ("starjax.cli.policy_evaluation",)
 
 
@@ -85,6 +87,13 @@ def start_jax(*modules: str) -> None:
 
     processes.join()
     jax_start.require_devices(*modules)
+
+
+def start_run(config: config_lib.RunConfig) -> None:
+    """Prints the first line of a run, then starts jax."""
+    named = f"method {config.method}, preset {config.preset}, seed {config.seed}"
+    jax_start.announce(f"{named}, folder {config.out}", sys.stdout)
+    start_jax(*RUN_MODULES)
 
 
 def start(name: str, argv: Sequence[str], folder: Path, free_bytes: int = 0) -> Session:

@@ -5,7 +5,9 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from starjax.runtime import files
+import jax.monitoring
+
+from starjax.runtime import files, precompile, processes
 
 # Tracing does not count: its events nest, and their sum means nothing.
 _COMPILE_EVENTS = (
@@ -21,8 +23,6 @@ def timed(out: Path, stage: str, resumes: bool = True) -> Iterator[None]:
     `stage` is all of them, `stage: compile` those in which jax compiled. Unless the work `resumes`
     from an earlier start, what that took does not count. Of several processes, the first one does.
     """
-    from starjax.runtime import processes
-
     if not processes.is_first():  # the first one's time is the run's
         yield
         return
@@ -61,8 +61,6 @@ class _CompileSeconds:
     """Sum of the durations of compilations that jax reports inside the context."""
 
     def __init__(self) -> None:
-        from starjax.runtime import precompile  # imports jax
-
         self.seconds, self._is_job = 0.0, precompile.is_job
 
     def _add(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
@@ -70,11 +68,7 @@ class _CompileSeconds:
             self.seconds += duration_secs
 
     def __enter__(self) -> None:
-        import jax.monitoring
-
         jax.monitoring.register_event_duration_secs_listener(self._add)
 
     def __exit__(self, *_: object) -> None:
-        import jax.monitoring
-
         jax.monitoring.unregister_event_duration_listener(self._add)

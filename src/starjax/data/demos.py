@@ -30,6 +30,8 @@ from starjax.rollouts import trocars as configurations
 from starjax.rollouts.agent import BatchAgent
 from starjax.rollouts.placement import DEFAULT_LAYOUT, DeviceLayout
 from starjax.runtime import files, progress, xla
+from starjax.sim.state import Env
+from starjax.sim.task import Task
 
 COMMITS = 16  # threads that write episodes; they mostly wait for the disk
 FRAME_GUESS = 300  # control steps of a typical demonstration, for estimates of disk and memory
@@ -39,7 +41,7 @@ GPU_LANES = 256  # episodes a GPU simulates together
 
 def collect(
     root: Path,
-    env: Any,
+    env: Env,
     agent: BatchAgent,
     trocars: Trocar,
     settings: DemoSettings,
@@ -129,7 +131,7 @@ def collect(
 
 
 def precompile(
-    env: Any, agent: BatchAgent, trocars: Trocar, settings: DemoSettings, params: Any = None
+    env: Env, agent: BatchAgent, trocars: Trocar, settings: DemoSettings, params: Any = None
 ) -> None:
     """Compiles, in the background, the programs that `collect` runs on one device."""
     trocars = configurations.listed(trocars, len(env.p_world_ref))
@@ -178,7 +180,7 @@ def _shown(
     return progress.track("Demonstrations", total, unit="episodes", done=done)
 
 
-def _require_finite(task: Any, episode: episodes.Episode) -> None:
+def _require_finite(task: Task, episode: episodes.Episode) -> None:
     """Raises UsageError for a task's state that is not finite; it names the field."""
     if "state" not in episode.arrays or np.isfinite(state := episode.joined("state")).all():
         return
@@ -194,7 +196,7 @@ def _require_finite(task: Any, episode: episodes.Episode) -> None:
 
 
 def _simulator(
-    env: Any,
+    env: Env,
     agent: BatchAgent,
     params: Any,
     trocars: Trocar,

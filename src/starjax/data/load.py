@@ -16,6 +16,7 @@ from starjax.data.episode_array import EpisodeArray
 from starjax.data.placed_images import JoinedImages
 from starjax.rollouts import episodes
 from starjax.runtime import files, xla
+from starjax.sim.state import Env
 
 Residency = Literal["auto", "device", "host", "disk"]
 
@@ -47,7 +48,7 @@ def load(
     residency: Residency = "auto",
     verify: bool = True,
     images: bool = True,
-    env: Any = None,
+    env: Env | None = None,
     sources: bool = False,
     rows: int = 0,
     report: Callable[[str], None] = print,
@@ -114,7 +115,7 @@ def actors(root: Path) -> np.ndarray:
     return EpisodeArray(_paths(root, records, "actor.npy"), start, length).read()
 
 
-def frames(root: Path, env: Any = None) -> "Mapping[str, EpisodeArray | redraw.DrawnImages]":
+def frames(root: Path, env: Env | None = None) -> "Mapping[str, EpisodeArray | redraw.DrawnImages]":
     """Returns the images of the successful episodes by camera, in the order of `load`.
 
     They are read or drawn when they are indexed. Only the episodes' records are checked.
@@ -178,7 +179,7 @@ def _fields(description: dict[str, Any], record: store.Record, images: bool) -> 
     return {name: file for name, file in found.items() if file in record["files"]}
 
 
-def _is_drawn(description: dict[str, Any], env: Any) -> bool:
+def _is_drawn(description: dict[str, Any], env: Env) -> bool:
     """Returns True if an environment draws the images: they were not recorded at its size."""
     return (
         env is not None

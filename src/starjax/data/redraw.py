@@ -18,6 +18,7 @@ from starjax.data import schema
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import episodes, programs, workers
 from starjax.runtime.precompile import Program
+from starjax.sim.state import Env, EnvParams, ImageSource
 
 # Images per call: as many on each device, because the batch size may change last bits. A core's
 # cache holds 16; a GPU needs more to be busy.
@@ -111,7 +112,7 @@ def expect_possible(argument: str, description: Mapping[str, Any], hint: str = "
         raise errors.UsageError(argument, expected, "others, whose images cannot be drawn", hint)
 
 
-def are_recorded(description: Mapping[str, Any], env: Any) -> bool:
+def are_recorded(description: Mapping[str, Any], env: Env) -> bool:
     """Returns True if a dataset holds images of an environment's cameras at its image size."""
     recorded = description["features"]
     return all(
@@ -120,9 +121,8 @@ def are_recorded(description: Mapping[str, Any], env: Any) -> bool:
     )
 
 
-def image_sizes(env: Any) -> dict[str, int]:
+def image_sizes(env: Env) -> dict[str, int]:
     """Returns the pixels per side of each camera of an environment."""
-    from starjax.sim.state import EnvParams
 
     def look(key: jax.Array) -> Any:
         zeros = jnp.zeros(np.shape(env.p_world_ref)[0])
@@ -147,7 +147,7 @@ def scene_env(description: Mapping[str, Any], image_size: int) -> Any:
 
 
 def sources(
-    root: Path, description: Mapping[str, Any], records: Sequence[Mapping[str, Any]], env: Any
+    root: Path, description: Mapping[str, Any], records: Sequence[Mapping[str, Any]], env: Env
 ) -> Sources:
     """Returns the sources of the images of all frames of episodes.
 
@@ -174,7 +174,7 @@ def sources(
 
 
 def images(
-    root: Path, description: Mapping[str, Any], records: Sequence[Mapping[str, Any]], env: Any
+    root: Path, description: Mapping[str, Any], records: Sequence[Mapping[str, Any]], env: Env
 ) -> dict[str, DrawnImages]:
     """Returns the images of all frames of episodes by camera, none of them drawn yet.
 
@@ -184,7 +184,7 @@ def images(
 
 
 def images_of(
-    found: Sources, records: Sequence[Mapping[str, Any]], env: Any
+    found: Sources, records: Sequence[Mapping[str, Any]], env: Env
 ) -> dict[str, DrawnImages]:
     """Returns `images` from their sources."""
     lengths = [record["length"] for record in records]
@@ -201,7 +201,7 @@ def images_of(
     }
 
 
-def precompile(env: Any, demos: int) -> dict[str, Any]:
+def precompile(env: Env, demos: int) -> dict[str, Any]:
     """Compiles, in the background, the programs that draw the images of so many episodes.
 
     Returns:
@@ -225,7 +225,6 @@ def precompile(env: Any, demos: int) -> dict[str, Any]:
 @functools.lru_cache(maxsize=4)
 def _start_program(reset: Callable[..., Any]) -> Program:
     """Returns the program from keys and trocars `[D]` to `Sources.episodes`."""
-    from starjax.sim.state import EnvParams, ImageSource
 
     def draw_start(key: jax.Array, trocar: Any) -> ImageSource:
         state = reset(key, EnvParams(trocar))

@@ -14,6 +14,8 @@ from starjax.rcm.trocar import Trocar
 from starjax.rollouts import episodes, programs
 from starjax.runtime import jax_settings, xla
 from starjax.sim import registries
+from starjax.sim.state import Env
+from starjax.sim.task import Task
 
 IMPORTED_FILES = "imported_files.json"  # bytes and time of each file of others
 IMPORTED = "imported.json"  # beside dataset.json: what was odd about the files of others
@@ -52,7 +54,7 @@ class DemoSettings(NamedTuple):
     disturbances: tuple[sources.Identity, ...] = ()
 
 
-def describe(env: Any, trocars: Trocar, settings: DemoSettings) -> dict[str, Any]:
+def describe(env: Env, trocars: Trocar, settings: DemoSettings) -> dict[str, Any]:
     """Describes a dataset: the content of dataset.json, and by `store.digest` its name.
 
     Args:
@@ -112,7 +114,7 @@ def frame_bytes(description: Mapping[str, Any]) -> int:
     return sum(math.prod(x["shape"]) * np.dtype(x["dtype"]).itemsize for x in features)
 
 
-def expert_name(task: Any, settings: DemoSettings) -> str:
+def expert_name(task: Task, settings: DemoSettings) -> str:
     """Returns the name of the expert, by default the task's first one."""
     name = settings.expert or next(iter(task.experts))
     errors.choice("expert", name, task.experts)

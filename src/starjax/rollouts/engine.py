@@ -20,6 +20,7 @@ import numpy as np
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import episodes, fetching, programs
 from starjax.rollouts.agent import BatchAgent
+from starjax.sim.state import Env
 
 
 class RolloutSettings(NamedTuple):
@@ -54,7 +55,7 @@ Run = Callable[[Any, Sequence[episodes.Trial]], Generator[Progress]]
 
 
 def make(
-    env: Any,
+    env: Env,
     agent: BatchAgent,
     trocars: Trocar,
     settings: RolloutSettings,
@@ -132,7 +133,7 @@ def make(
 
 
 def precompile(
-    env: Any,
+    env: Env,
     agent: BatchAgent,
     params: Any,
     trocars: Trocar,

@@ -15,6 +15,7 @@ from starjax.rcm.trocar import Trocar
 from starjax.rollouts import episodes, placement
 from starjax.rollouts.agent import BatchAgent
 from starjax.runtime import precompile
+from starjax.sim.state import Env, EnvParams
 
 
 class Trials(NamedTuple):
@@ -43,14 +44,14 @@ class RolloutState(NamedTuple):
       active: `[N]` bool, see `Trials`.
     """
 
-    env: Any
+    env: Env
     memory: Any
     length: jax.Array
     active: jax.Array
 
 
 def make(
-    env: Any,
+    env: Env,
     agent: BatchAgent,
     max_steps: int,
     record: episodes.Record,
@@ -109,13 +110,10 @@ def _programs(
 
 
 def _starter(env: _EnvFns, agent: _AgentFns) -> Callable[..., RolloutState]:
-    # Imported here, as only programs need it: reading a dataset does not load the simulator.
-    from starjax.sim import env as sim_env
-
     def start_one(key: jax.Array, trials: Trials, levels: Any) -> tuple[Any, jax.Array]:
         key = jax.random.fold_in(jax.random.fold_in(key, trials.index), trials.trial)
         key_env, key_agent = jax.random.split(key)
-        return env.reset(key_env, sim_env.EnvParams(trials.trocar, levels=levels)), key_agent
+        return env.reset(key_env, EnvParams(trials.trocar, levels=levels)), key_agent
 
     def start(key: jax.Array, params: Any, trials: Trials, levels: Any) -> RolloutState:
         state, keys = jax.vmap(start_one, in_axes=(None, 0, None))(key, trials, levels)
@@ -177,7 +175,7 @@ def _of_all(observe: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _fields(
-    env: Any, record: episodes.Record, state: Any, memory: Any = None
+    env: Env, record: episodes.Record, state: Any, memory: Any = None
 ) -> dict[str, jax.Array]:
     """Records N episodes that stand still, for the shapes."""
     observed = _of_all(env.observe)(state) if record.observes else None
@@ -185,7 +183,7 @@ def _fields(
     return record.fields(episodes.Step(observed, command, command, state, state, memory))
 
 
-def frame(env: Any, record: episodes.Record) -> dict[str, jax.ShapeDtypeStruct]:
+def frame(env: Env, record: episodes.Record) -> dict[str, jax.ShapeDtypeStruct]:
     """Returns the shapes of one recorded control step, without computing anything."""
     functions = _EnvFns(env.reset, env.step, env.observe, env.labels)
     return dict(_frame(functions, len(env.p_world_ref), record))
@@ -193,18 +191,16 @@ def frame(env: Any, record: episodes.Record) -> dict[str, jax.ShapeDtypeStruct]:
 
 @functools.lru_cache(maxsize=4)  # a trace takes seconds, and a dataset is described several times
 def _frame(env: _EnvFns, arms: int, record: episodes.Record) -> dict[str, jax.ShapeDtypeStruct]:
-    from starjax.sim import env as sim_env
-
     def one(key: jax.Array) -> dict[str, jax.Array]:
         zeros = jnp.zeros(arms)
-        state = env.reset(key, sim_env.EnvParams(Trocar(zeros, zeros, zeros)))
+        state = env.reset(key, EnvParams(Trocar(zeros, zeros, zeros)))
         batch = jax.tree.map(lambda x: jnp.asarray(x)[None], state)
         return jax.tree.map(lambda x: x[0], _fields(env, record, batch))
 
     return precompile.Program(one).shapes(jax.random.key(0))
 
 
-def status(env: Any, carry: RolloutState) -> dict[str, Any]:
+def status(env: Env, carry: RolloutState) -> dict[str, Any]:
     """Returns the status of N episodes: `over`, `length`, flags, `stage` and `labels`, `[N]`."""
     state = carry.env
     found = {

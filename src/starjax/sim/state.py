@@ -1,7 +1,7 @@
 """Environment record, its parameters and its state."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import flax.struct
 import jax
@@ -10,10 +10,12 @@ import numpy as np
 
 from starjax import rcm
 from starjax.core.types import Command, Observation, Pose
-from starjax.sim import physics, render
 from starjax.sim.names import SceneNames
-from starjax.sim.scene import Scene
 from starjax.sim.task import Task
+
+if TYPE_CHECKING:  # readers of datasets need no simulator
+    from starjax.sim import physics, render
+    from starjax.sim.scene import Scene
 
 
 class EnvParams(NamedTuple):
@@ -101,7 +103,7 @@ class EnvState:
         whose look does not vary.
     """
 
-    physics: physics.PhysicsState
+    physics: "physics.PhysicsState"
     q_target: tuple[jax.Array, ...]
     q_velocity: tuple[jax.Array, ...]
     velocity: jax.Array
@@ -166,10 +168,10 @@ class Env(NamedTuple):
     reset: Callable[[jax.Array, EnvParams], EnvState]
     step: Callable[[EnvState, Command], EnvState]
     observe: Callable[[EnvState], Observation]
-    camera: Callable[[EnvState], dict[str, render.CameraImage]]
-    draw: Callable[[ImageSource], dict[str, render.CameraImage]]
+    camera: "Callable[[EnvState], dict[str, render.CameraImage]]"
+    draw: "Callable[[ImageSource], dict[str, render.CameraImage]]"
     labels: Callable[[EnvState], dict[str, jax.Array]]
-    scene: Scene
+    scene: "Scene"
     task: Task
     names: SceneNames
     p_world_ref: np.ndarray

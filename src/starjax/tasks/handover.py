@@ -122,14 +122,11 @@ def _act(
     play: Play, script: HandoverScript, state: EnvState
 ) -> tuple[Command, HandoverScript, Command]:
     """Returns the disturbed commands to execute, the script, and the undisturbed ones to record."""
-    is_of_jaws = jnp.asarray(scripting.is_of_jaws(play.jaws))[script.phase]
-    target = jnp.asarray(play.jaws, jnp.float32)[script.phase]
-    is_over = script.elapsed >= script.duration - 1e-6
-    is_over |= is_of_jaws & scripting.have_arrived(target, state)
+    is_over = scripting.is_over(script, play.jaws, state)
     after = _enter(play, script, play.following(script, state), state)
     script = jax.tree.map(lambda a, b: jnp.where(is_over, a, b), after, script)
     elapsed = script.elapsed + 1.0 / CONTROL_HZ
-    s = jnp.clip(elapsed / script.duration, 0.0, 1.0)
+    s = jnp.clip(elapsed / script.duration, 0.0, 1.0)  # share of the phase's time
     # On the way down a tool is above its goal before anything can touch.
     aside, turned = (
         scripting.sloped(jnp.minimum(s / jnp.asarray(at, jnp.float32)[script.phase], 1.0))
@@ -141,14 +138,16 @@ def _act(
     target = jnp.asarray(play.jaws, jnp.float32)[script.phase]
     script = script.replace(
         elapsed=elapsed,
+        # x, y ahead of z
         p=script.start + jnp.stack([aside, aside, fraction]) * (script.goal - script.start),
         roll=script.roll_from + turned * (script.roll_to - script.roll_from),
         jaws=scripting.jaws(script.jaws_from, target, elapsed),
         noise=noise,
     )
-    moved = play.weight(script.phase, fraction) * noise[1].reshape(2, 4)
+    moved = play.weight(script.phase, fraction) * noise[1].reshape(2, 4)  # [A, (x, y, z, roll)]
     roll, p = script.roll + moved[:, 3], script.p + moved[:, :3]
     rough = play.command(roll, p, script.jaws, state)
+    # The label is undisturbed: it shows how to come back from where the disturbance has led.
     return rough, script, play.command(script.roll, script.p, script.jaws, state)
 
 
@@ -157,6 +156,7 @@ def _enter(play: Play, script: HandoverScript, phase: jax.Array, state: EnvState
     goals, normal = play.goals(script, state)
     goal = goals[phase]
     normals = jnp.where(jnp.asarray(play.looks)[phase][:, None], normal, script.normal)
+    # Rolls are counted from roll 0 at the goal, where the turn must be right.
     at_zero = play.command(jnp.zeros(2), goal, script.jaws, state).pose.R
     is_of_jaws = jnp.asarray(scripting.is_of_jaws(play.jaws))[phase]
     limit = scripting.jaw_limit(script.jaws, jnp.asarray(play.jaws, jnp.float32)[phase])
@@ -169,6 +169,7 @@ def _enter(play: Play, script: HandoverScript, phase: jax.Array, state: EnvState
         goal=goal,
         normal=normals,
         roll_from=script.roll,
+        # jaws are symmetric
         roll_to=scripting.nearer_half(scripting.turn_to(normals, at_zero), script.roll),
         jaws_from=script.jaws,
     )

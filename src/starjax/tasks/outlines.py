@@ -3,20 +3,23 @@
 `mj_model` is a `mujoco.MjModel` with the task in it.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:  # a robot loads tasks without the simulator
+    import mujoco
 
 CORNERS = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])  # a square of side 2
 
 
-def rectangle(mj_model: Any, name: str) -> np.ndarray:
+def rectangle(mj_model: "mujoco.MjModel", name: str) -> np.ndarray:
     """Returns the corners `[4, 3]` m of a box or plane, on the ground."""
     geom = mj_model.geom(name)
     return geom.pos * [1, 1, 0] + geom.size * CORNERS
 
 
-def named(mj_model: Any, *prefixes: str) -> list[Any]:
+def named(mj_model: "mujoco.MjModel", *prefixes: str) -> list[Any]:
     """Returns the geoms whose names begin with one of the prefixes."""
     geoms = (mj_model.geom(i) for i in range(mj_model.ngeom))
     return [geom for geom in geoms if geom.name.startswith(prefixes)]

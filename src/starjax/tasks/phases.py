@@ -155,10 +155,11 @@ def enter(
 ) -> ScriptT:
     """Returns the script at the start of `phase`, whose goal is that of `goals` `[P]`."""
     goal = jnp.stack(goals)[phase]
-    length = jnp.linalg.norm(goal[-3:] - script.at[-3:])
+    length = jnp.linalg.norm(goal[-3:] - script.at[-3:])  # m: a goal may begin with a roll
     least, speed, jaws = (
         jnp.asarray(rows)[phase] for rows in (timing.duration, timing.speed, timing.jaws)
     )
+    # Long ways at their mean speed; short ones no faster than the least time.
     duration = jnp.maximum(least, length / speed) / script.tempo
     limit = scripting.jaw_limit(script.jaws, jaws)
     # A tool that is high already rises no longer than its jaws take to let go.
@@ -183,12 +184,10 @@ def advance(
 
     Jaws are those of the new step; the position is the caller's to set.
     """
-    is_of_jaws = jnp.asarray(scripting.is_of_jaws(timing.jaws))[script.phase]
-    target = jnp.asarray(timing.jaws)[script.phase]
-    is_over = script.elapsed >= script.duration - 1e-6
-    is_over |= is_of_jaws & scripting.have_arrived(target, state)
+    is_over = scripting.is_over(script, timing.jaws, state)
     script = jax.tree.map(lambda a, b: jnp.where(is_over, a, b), after, script)
     elapsed = script.elapsed + 1.0 / CONTROL_HZ
+    # By the time since the phase began, in any phase: jaws that still move go on.
     jaws = scripting.jaws(script.jaws_from, jnp.asarray(timing.jaws)[script.phase], elapsed)
     s = jnp.clip(elapsed / script.duration, 0.0, 1.0)
     return script.replace(elapsed=elapsed, jaws=jaws), s
@@ -197,7 +196,7 @@ def advance(
 def horizontal(normal: jax.Array) -> jax.Array:
     """Returns the horizontal unit vector `[3]` along a normal `[3]`."""
     out = normal * jnp.array([1.0, 1.0, 0.0])
-    return out / jnp.maximum(jnp.linalg.norm(out), 1e-6)
+    return out / jnp.maximum(jnp.linalg.norm(out), 1e-6)  # zero for a vertical normal
 
 
 def towards_arm(normal: jax.Array) -> jax.Array:
@@ -221,6 +220,7 @@ def agent(init: Callable[[jax.Array, EnvState], Any], grasp: Grasp) -> Agent:
         noise = scripting.disturb(script.key, script.noise, state.step, deviation)
         script = script.replace(roll=_roll(script, grasp.lead(script), state), noise=noise)
         weight = jnp.asarray(grasp.disturbance)[script.phase]
+        # The low-passed copy of the noise, which a robot can follow.
         moved = weight * noise[1] * jnp.where(script.phase == DESCEND, 1.0 - s, 1.0)
         rough = _command(script.roll + moved[3], script.at + moved[:3], script, state)
         label = _command(script.roll, script.at, script, state)
@@ -235,10 +235,11 @@ def agent(init: Callable[[jax.Array, EnvState], Any], grasp: Grasp) -> Agent:
 def _roll(script: GraspScript, lead: jax.Array, state: EnvState) -> jax.Array:
     """Returns the roll (rad) at the present position, turning towards the normal."""
     R = _command(jnp.zeros(()), script.at, script, state).pose.R[0]
+    # R_z(roll) takes y to the normal: n . x' = 0 for x' = cos x + sin y.
     on_normal = jnp.arctan2(-script.normal @ R[:, 0], script.normal @ R[:, 1])
     turned = jnp.clip(lead * script.tempo / TURN_TIME, 0.0, 1.0)
     turned = jnp.where(script.phase > DESCEND, 1.0, jnp.where(script.phase == RAISE, 0.0, turned))
-    weight = 0.5 - 0.5 * jnp.cos(jnp.pi * turned)
+    weight = 0.5 - 0.5 * jnp.cos(jnp.pi * turned)  # smooth at both ends
     return script.roll_from + weight * (on_normal - script.roll_from)
 
 

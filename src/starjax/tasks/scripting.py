@@ -4,6 +4,8 @@ A policy that plans anew every few steps cannot tell how long a demonstration ha
 motions spend little time near rest, and jaws are waited for no longer than they take to arrive.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,14 +30,15 @@ def sloped(fraction: jax.Array) -> jax.Array:
 
     Its speed grows and falls evenly during `SLOPE` of the time at either end.
     """
-    left = jnp.minimum(fraction, 1.0 - fraction)
+    left = jnp.minimum(fraction, 1.0 - fraction)  # symmetric in time
+    # Trapezoid of speed: its area up to SLOPE is a parabola, then a line.
     done = jnp.where(left < SLOPE, left**2 / (2.0 * SLOPE), left - SLOPE / 2.0) / (1.0 - SLOPE)
     return jnp.where(fraction < 0.5, done, 1.0 - done)
 
 
 def jaws(before: jax.Array, target: jax.Array, elapsed: jax.Array) -> jax.Array:
     """Returns the openings `[...]` `elapsed` s after the start of a motion to `target`."""
-    most = 2.0 * elapsed / JAW_TIME
+    most = 2.0 * elapsed / JAW_TIME  # openings from -1 to 1 in JAW_TIME
     return before + jnp.clip(target - before, -most, most)
 
 
@@ -55,9 +58,20 @@ def jaw_limit(before: jax.Array, target: jax.Array) -> jax.Array:
 
 def have_arrived(target: jax.Array, state: EnvState) -> jax.Array:
     """Returns True once jaws `[A]` on their way to `target` grip, or are open."""
+    # Contact alone is not yet a grip: jaws that still close would be stopped half-way.
     is_sent = state.gripper_target < target + 1e-3
     grip = is_sent & state.touch & (state.gripper < SHUT)
     return jnp.all(jnp.where(target < 0.0, grip, state.gripper > OPENED))
+
+
+def is_over(script: Any, jaws: np.ndarray | tuple[float, ...], state: EnvState) -> jax.Array:
+    """Returns True at the end of a script's present phase: of its time, or its jaws have arrived.
+
+    `jaws` are openings `[P, ...]` as in `is_of_jaws`.
+    """
+    target = jnp.asarray(jaws, jnp.float32)[script.phase]
+    has_arrived = jnp.asarray(is_of_jaws(jaws))[script.phase] & have_arrived(target, state)
+    return (script.elapsed >= script.duration - 1e-6) | has_arrived
 
 
 def command(roll: jax.Array, p: jax.Array, jaws: jax.Array, state: EnvState) -> Command:
@@ -76,11 +90,12 @@ def turn_to(normal: jax.Array, R: jax.Array) -> jax.Array:
     `R` `[A, 3, 3]` are the tools' rotations at roll 0.
     """
     across = jnp.einsum("ai,aij->aj", normal, R, precision="highest")
-    return jnp.arctan2(-across[:, 0], across[:, 1])
+    return jnp.arctan2(-across[:, 0], across[:, 1])  # across = R' n: the normal in the tool
 
 
 def nearer_half(turned: jax.Array, roll: jax.Array) -> jax.Array:
     """Returns `turned` rad plus a multiple of half a turn (jaws are symmetric), next to `roll`."""
+    # within a quarter turn of `roll`
     return roll + (turned - roll + jnp.pi / 2) % jnp.pi - jnp.pi / 2
 
 
@@ -94,10 +109,11 @@ def disturb(key: jax.Array, noise: jax.Array, step: jax.Array, deviation: jax.Ar
       deviation: `[n]`, standard deviation of the rough one.
     """
     dt = 1.0 / CONTROL_HZ
-    keep = jnp.exp(-dt / CORRELATION)
+    keep = jnp.exp(-dt / CORRELATION)  # AR(1) factor of the sampled process
     drawn = jax.random.normal(
         jax.random.fold_in(jax.random.fold_in(key, NOISE_STREAM), step), deviation.shape
     )
+    # stationary variance deviation^2
     rough = keep * noise[0] + deviation * jnp.sqrt(1.0 - keep**2) * drawn
-    smooth = noise[1] + dt / SMOOTHING * (rough - noise[1])
+    smooth = noise[1] + dt / SMOOTHING * (rough - noise[1])  # first-order low-pass
     return jnp.stack([rough, smooth])

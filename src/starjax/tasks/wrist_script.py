@@ -38,21 +38,39 @@ def rotations(R: jax.Array) -> dict[str, jax.Array]:
     return {"R_from": R, "R_goal": R, "R": R}
 
 
+def enter(
+    script: Any,
+    timing: phases.PhaseTable,
+    phase: jax.Array,
+    goals: list[jax.Array],
+    R_goal: jax.Array,
+    **own: Any,
+) -> Any:
+    """Returns the script at the start of `phase`, see `phases.enter`; `R_goal` is for its end.
+
+    An attempt begins with each approach.
+    """
+    attempt = script.attempt + (phase == phases.APPROACH)
+    rotation = {"R_from": script.R, "R_goal": R_goal}
+    return phases.enter(script, timing, phase, goals, attempt=attempt, **rotation, **own)
+
+
 def held(state: EnvState, needle: Pose) -> Pose:
     """Returns pose_tip_needle as measured."""
     tip = jax.tree.map(lambda leaf: leaf[0], state.pose)
+    # T_tip_needle = T_world_tip^-1 T_world_needle
     return Pose(tip.R.T @ needle.R, tip.R.T @ (needle.p - tip.p))
 
 
 def tip_of(needle: Pose, held: Pose) -> Pose:
     """Returns pose_world_tip of a needle's pose and its pose_tip_needle."""
     R = needle.R @ held.R.T
-    return Pose(R, needle.p - R @ held.p)
+    return Pose(R, needle.p - R @ held.p)  # T_world_tip = T_world_needle T_tip_needle^-1
 
 
 def straight(script: WristScript, share: jax.Array) -> Pose:
     """Returns pose_world_tip at a fraction of the straight way to the phase's goal."""
-    turn = share * ik.rotation_between(script.R_from, script.R_goal)
+    turn = share * ik.rotation_between(script.R_from, script.R_goal)  # geodesic: constant axis
     return Pose(
         Rotation.from_rotvec(turn).as_matrix() @ script.R_from,
         script.start + share * (script.goal - script.start),
@@ -61,6 +79,7 @@ def straight(script: WristScript, share: jax.Array) -> Pose:
 
 def from_start(script: WristScript, first: Pose, now: Pose, share: jax.Array) -> Pose:
     """Returns `now` of a way from `first`, moved by a share of the gap to the phase's start."""
+    # The gap between the arc's start and where the tool is vanishes on the way, without a jump.
     left = (1.0 - share) * ik.rotation_between(first.R, script.R_from)
     R = Rotation.from_rotvec(left).as_matrix() @ now.R
     return Pose(R, now.p + (1.0 - share) * (script.start - first.p))
@@ -95,6 +114,7 @@ def commands(
 def _command(script: WristScript, tip: Pose, state: EnvState) -> Command:
     """Returns the command `[1]` of a tip's pose, with the script's jaws."""
     p_trocar: Any = state.measured_trocar.p_world_trocar[0]
+    # the shaft through the trocar, and the wrist's angles
     found = rcm.through(WRIST, tip, p_trocar)
     pose = Pose(found.pose.R[None], found.pose.p[None])
     return Command(pose, script.jaws[None], found.wrist[None])

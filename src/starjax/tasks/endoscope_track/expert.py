@@ -69,10 +69,11 @@ def act(script: TrackScript, state: EnvState) -> tuple[Command, TrackScript, Com
 
     def way(distance: jax.Array | float) -> jax.Array:
         line = script.start + fraction * (_target(distance, state) - script.start)
+        # parabola, 1 at its middle
         return line.at[1:].add(4.0 * fraction * (1.0 - fraction) * script.side)
 
     noise = scripting.disturb(script.key, script.noise, state.step, jnp.array(DEVIATION))
-    weight = 1.0 - (1.0 - DISTURBANCE) * s
+    weight = 1.0 - (1.0 - DISTURBANCE) * s  # less once the target is in the middle
     script = script.replace(elapsed=elapsed, noise=noise)
     disturbed = way(script.distance) + weight * jnp.roll(noise[1], 1)
     return _command(disturbed, state), script, _command(way(DISTANCE), state)
@@ -81,8 +82,9 @@ def act(script: TrackScript, state: EnvState) -> tuple[Command, TrackScript, Com
 def _target(distance: jax.Array | float, state: EnvState) -> jax.Array:
     """Returns roll and position `[4]` with the target centred and level at `distance`."""
     measurements = state.measurements
+    # a step ahead: the command takes one
     aim = measurements.target + measurements.velocity / CONTROL_HZ
-    R_tip_camera = state.pose.R[0].T @ measurements.camera.R
+    R_tip_camera = state.pose.R[0].T @ measurements.camera.R  # fixed: the camera rides on the tip
     pose = looking_at(aim, state.measured_trocar.p_world_trocar[0], distance, R_tip_camera)
     return jnp.append(rcm.roll_of(pose.R) - state.measured_trocar.roll_zero[0], pose.p)
 

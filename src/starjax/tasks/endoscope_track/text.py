@@ -1,9 +1,12 @@
 """Phrases and drawing of endoscope tracking, for reports."""
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 from starjax.sim.task import Outline, TaskText
 from starjax.tasks import outlines
+
+if TYPE_CHECKING:  # a robot loads tasks without the simulator
+    import mujoco
 
 TEXT = TaskText(
     title="endoscope tracking",
@@ -20,7 +23,7 @@ TEXT = TaskText(
 HALF = 0.085  # m, of the square that is drawn
 
 
-def outline(mj_model: Any) -> Outline:
+def outline(mj_model: "mujoco.MjModel") -> Outline:
     """Returns a square of tissue and the vessels."""
     vessels = tuple(map(outlines.capsule_ends, outlines.named(mj_model, "vessel")))
     return Outline((HALF * outlines.CORNERS,), vessels)

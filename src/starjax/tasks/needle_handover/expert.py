@@ -54,8 +54,9 @@ def _choose(key: jax.Array, state: EnvState) -> tuple[jax.Array, jax.Array, jax.
     R = state.measurements.needle.R
     give, take = PAIRS.T
     skew = jnp.abs(TANGENTS @ R[1])  # tilt of each segment's normal from the world's y
-    aside = (MIDDLES[take] - MIDDLES[give]) @ R[0]
+    aside = (MIDDLES[take] - MIDDLES[give]) @ R[0]  # m along x: the taker comes from +x
     score = (ASIDE * aside - skew[give] - skew[take]) / SKEW
+    # Drawn with the preference as logits: neighbours of the best pair are demonstrated too.
     pair = jax.random.categorical(key_pair, score)
     tempo = jax.random.uniform(key_tempo, minval=TEMPO[0], maxval=TEMPO[1])
     return key, tempo, jnp.asarray(PAIRS)[pair]
@@ -63,16 +64,16 @@ def _choose(key: jax.Array, state: EnvState) -> tuple[jax.Array, jax.Array, jax.
 
 def _following(script: handover.HandoverScript, state: EnvState) -> jax.Array:
     """Returns the next phase, an earlier one if a tool missed the wire."""
-    missed = (script.phase == PHASES.index("lift")) & ~state.measurements.touch[0]
+    missed = (script.phase == PHASES.index("lift")) & ~state.measurements.touch[0]  # the giver
     following = jnp.where(missed, 0, jnp.minimum(script.phase + 1, len(PHASES) - 1))
-    missed = (script.phase == PHASES.index("take")) & ~state.measurements.touch[1]
+    missed = (script.phase == PHASES.index("take")) & ~state.measurements.touch[1]  # the taker
     return jnp.where(missed, PHASES.index("near"), following).astype(jnp.int32)
 
 
 def _weight(phase: jax.Array, fraction: jax.Array) -> jax.Array:
     weights = jnp.asarray(DISTURBANCE, jnp.float32)
     before, weight = weights[jnp.maximum(phase - 1, 0)], weights[phase]
-    return before + fraction * (weight - before)
+    return before + fraction * (weight - before)  # no jump between phases
 
 
 def goals(
@@ -85,28 +86,29 @@ def goals(
       script, state: as of a `Play`.
     """
     needle, tips = state.measurements.needle, script.p
+    # Horizontal normals of both segments, from the needle as it lies now: it turns in the jaws.
     across = jnp.cross(jnp.asarray(TANGENTS)[script.held] @ needle.R.T, jnp.array([0.0, 0.0, 1.0]))
     across = across / jnp.maximum(jnp.linalg.norm(across, axis=-1, keepdims=True), 1e-6)
     normal = across * jnp.where(across[:, 1:2] > 0, -1.0, 1.0)
-    wire = needle.p + jnp.asarray(MIDDLES)[script.held] @ needle.R.T
+    wire = needle.p + jnp.asarray(MIDDLES)[script.held] @ needle.R.T  # [2, 3]: giver's, taker's
     give, take = wire + jnp.array([0.0, 0.0, above])
     out = handover.OUT * across
     park, up = jnp.array(PARK), jnp.array([0.0, 0.0, HOVER])
     lifted, high = state.layout.needle.p[2] + above + HOVER, MEET[2] + above + RAISE
     goals = jnp.stack(
         [
-            jnp.stack([give + out[0] + up, park[1]]),
-            jnp.stack([give, park[1]]),
-            tips.at[0].set(give),
-            tips.at[0, 2].max(lifted),
-            jnp.stack([tips[0] + jnp.array(MEET) - wire[0], park[1]]),
-            jnp.stack([tips[0], take + out[1] + jnp.array(COME)]),
-            jnp.stack([tips[0], take]),
-            tips.at[1].set(take),
+            jnp.stack([give + out[0] + up, park[1]]),  # above
+            jnp.stack([give, park[1]]),  # down
+            tips.at[0].set(give),  # close
+            tips.at[0, 2].max(lifted),  # lift
+            jnp.stack([tips[0] + jnp.array(MEET) - wire[0], park[1]]),  # carry
+            jnp.stack([tips[0], take + out[1] + jnp.array(COME)]),  # near
+            jnp.stack([tips[0], take]),  # meet
+            tips.at[1].set(take),  # take
             tips,
-            tips.at[0].set(give + jnp.array(GO)),
-            tips.at[1, 2].max(high),
-            tips.at[1, 2].set(jnp.clip(high + TOP, tips[1, 2], tips[1, 2] + phases.RISE)),
+            tips.at[0].set(give + jnp.array(GO)),  # away
+            tips.at[1, 2].max(high),  # raise
+            tips.at[1, 2].set(jnp.clip(high + TOP, tips[1, 2], tips[1, 2] + phases.RISE)),  # hold
         ]
     )
     return goals, normal

@@ -53,24 +53,28 @@ def _enter(script: NeedleScript, phase: jax.Array, state: EnvState) -> NeedleScr
     needle, tip = state.measurements.needle, script.at
     is_approach = phase == APPROACH
     attempt = script.attempt + is_approach
+    # Jaws close across the wire: the horizontal normal of each segment, in the world.
     normals = jnp.cross(jnp.asarray(TANGENTS), jnp.array([0.0, 0.0, 1.0])) @ needle.R.T
     # Pads of a tool with a wrist are as wide as a segment. In C MuJoCo, not in our physics, they
     # touch the point from the segment next to it.
     last = task.SEGMENTS - (1 if state.wrist is None else 2)
     inner = (jnp.arange(task.SEGMENTS) > 0) & (jnp.arange(task.SEGMENTS) < last)
     score = jnp.where(inner, -jnp.abs(normals[:, 0]) / SKEW, -jnp.inf)
+    # Softmax of -|sin| / SKEW: segments whose jaws would open along y, as they do at roll 0, but
+    # not the same one always.
     drawn = jax.random.categorical(jax.random.fold_in(script.key, attempt), score)
     segment = jnp.where(is_approach, drawn, script.segment)
-    out = phases.horizontal(normals[segment])
+    out = phases.horizontal(normals[segment])  # aside of the wire: a descent beside it is seen
+    # R_world_needle p_needle + p
     grasp = needle.p + needle.R @ jnp.asarray(MIDDLES)[segment] + jnp.array([0.0, 0.0, GRASP_ABOVE])
     high = state.layout.needle.p[2] + GRASP_ABOVE + LIFT_HEIGHT + TOP
     goals = [
-        tip.at[2].set(jnp.maximum(tip[2], HOVER)),
-        grasp + HOVER_OUT * out + jnp.array([0.0, 0.0, HOVER]),
+        tip.at[2].set(jnp.maximum(tip[2], HOVER)),  # RAISE
+        grasp + HOVER_OUT * out + jnp.array([0.0, 0.0, HOVER]),  # APPROACH
         grasp,
         tip,
-        tip.at[2].add(LIFT_HEIGHT),
-        tip.at[2].set(jnp.clip(high, tip[2], tip[2] + phases.RISE)),
+        tip.at[2].add(LIFT_HEIGHT),  # LIFT
+        tip.at[2].set(jnp.clip(high, tip[2], tip[2] + phases.RISE)),  # HOLD: it rises on slowly
     ]
     return phases.enter(
         script,
@@ -79,7 +83,10 @@ def _enter(script: NeedleScript, phase: jax.Array, state: EnvState) -> NeedleScr
         goals,
         attempt=attempt,
         segment=segment,
+        # Fixed once the wire is held: the needle turns with the jaws, and would turn them on and
+        # on.
         normal=jnp.where(phase <= DESCEND, phases.towards_arm(out), script.normal),
+        # one turn for approach and descent
         roll_from=jnp.where(phase <= APPROACH, script.roll, script.roll_from),
     )
 

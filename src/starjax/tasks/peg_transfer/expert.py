@@ -69,8 +69,10 @@ def _following(script: PegScript, state: EnvState) -> jax.Array:
     """Returns the next phase, the first one if the block is not held, or not on its peg."""
     phase, block = script.phase, state.measurements.block
     grasped = block.p + task.RIM_RADIUS * task.wall_normals(block)[script.wall]
+    # By place: jaws also touch a block that they have just let slip.
     is_held = jnp.sum((grasped - state.pose.p[0]) ** 2) < HELD**2
     is_lost = (phase >= LIFT) & (phase <= CARRY) & ~is_held
+    # Only after the release is it seen if the block has come down on its peg.
     is_off = (phase == RETREAT) & ~task.is_threaded(block, state.layout.target_peg)
     again = is_lost | is_off | (phase == WAIT)
     return jnp.where(again, RAISE, phase + 1).astype(jnp.int32)
@@ -86,17 +88,19 @@ def _enter(script: PegScript, phase: jax.Array, state: EnvState) -> PegScript:
     normals = task.wall_normals(block)
     # The jaws' axis stays within 60 degrees of the world's y: the roll then never meets its wrap.
     skew = jnp.abs(normals[:, 0])
-    is_candidate = skew <= jnp.sort(skew)[CANDIDATES - 1]
+    is_candidate = skew <= jnp.sort(skew)[CANDIDATES - 1]  # normals with the smallest |x|
     # The candidate towards the board's middle is preferred: its shaft leans away from the peg.
     # On the middle row it is the one that needs less roll, or either if they are equivalent.
     unlike = normals[:, 1] * (block.p[1] - script.middle) / OUTWARD + skew / SKEW
     chosen = jax.random.categorical(key_wall, jnp.where(is_candidate, -unlike, -jnp.inf))
     wall = jnp.where(is_approach, chosen, script.wall)
-    out = phases.horizontal(normals[wall])
+    out = phases.horizontal(normals[wall])  # the block may be tilted
+    # Beside the wall's middle, left or right: two modes of the demonstrations.
     side = jnp.where(is_approach, jax.random.rademacher(key_side, (), jnp.float32), script.side)
     tangent = jnp.cross(block.R[:, 2], normals[wall])
     grasp = block.p + task.RIM_RADIUS * normals[wall] + side * GRASP_SIDE * tangent
     grasp = grasp - jnp.array([0.0, 0.0, GRASP_DROP])
+    # approaches of many places, as a policy's will be
     spread = HOVER_SPREAD * jax.random.normal(key_hover, (3,)) * jnp.array([1.0, 1.0, 0.5])
     hover = task.RIM_HEIGHT - GRASP_DROP + HOVER
     # The tip's position once the block, tilted by now, is upright over the target peg: on its wall,
@@ -106,16 +110,16 @@ def _enter(script: PegScript, phase: jax.Array, state: EnvState) -> PegScript:
     over = state.layout.target_peg + (task.RIM_RADIUS + RELEASE_SHIFT) * out[:2] + aside
     low = task.RIM_HEIGHT - GRASP_DROP + RELEASE_HEIGHT
     goals = [
-        tip.at[2].set(jnp.maximum(tip[2], hover)),
-        grasp.at[2].set(hover) + HOVER_OUT * out + spread,
+        tip.at[2].set(jnp.maximum(tip[2], hover)),  # RAISE
+        grasp.at[2].set(hover) + HOVER_OUT * out + spread,  # APPROACH
         grasp,
         tip,
-        tip.at[2].set(hover),
-        jnp.append(over, hover),
-        jnp.append(over, low),
+        tip.at[2].set(hover),  # LIFT
+        jnp.append(over, hover),  # CARRY
+        jnp.append(over, low),  # LOWER
         tip,
-        tip.at[2].set(tip[2] + HOVER),
-        tip.at[2].add(phases.RISE),
+        tip.at[2].set(tip[2] + HOVER),  # RETREAT
+        tip.at[2].add(phases.RISE),  # WAIT
     ]
     return phases.enter(
         script,
@@ -125,6 +129,7 @@ def _enter(script: PegScript, phase: jax.Array, state: EnvState) -> PegScript:
         attempt=attempt,
         wall=wall,
         side=side,
+        # the block turns with the jaws
         normal=jnp.where(phase <= DESCEND, phases.towards_arm(out), script.normal),
         roll_from=jnp.where(phase <= APPROACH, script.roll, script.roll_from),
     )

@@ -1,9 +1,12 @@
 """Phrases and drawing of peg transfer, for reports."""
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 from starjax.sim.task import Outline, TaskText
 from starjax.tasks import outlines
+
+if TYPE_CHECKING:  # a robot loads tasks without the simulator
+    import mujoco
 
 TEXT = TaskText(
     title="peg transfer",
@@ -18,7 +21,7 @@ TEXT = TaskText(
 BOARDS = ("board_source", "board_target")
 
 
-def outline(mj_model: Any) -> Outline:
+def outline(mj_model: "mujoco.MjModel") -> Outline:
     """Returns the boards' rectangles and the pegs."""
     areas = tuple(outlines.rectangle(mj_model, name) for name in BOARDS)
     # A peg is a capsule along z: its cap ends the size and half the length above its middle.

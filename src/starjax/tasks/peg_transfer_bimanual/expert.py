@@ -58,11 +58,12 @@ def _choose(key: jax.Array, state: EnvState) -> tuple[jax.Array, jax.Array, Any]
     block = state.measurements.block
     normals = single.wall_normals(block)
     way = state.layout.target_peg[1] - block.p[1]
+    # |n_x| is the sine of the roll; the second term prefers the wall at the back of the path.
     out = normals[jnp.argmin(jnp.abs(normals[:, 0]) + RAISED * way * normals[:, 1])]
     along = jnp.cross(block.R[:, 2], out)
-    along = along * jnp.where(along[0] < 0, -1.0, 1.0)
+    along = along * jnp.where(along[0] < 0, -1.0, 1.0)  # towards +x: the taker's side
     tempo = jax.random.uniform(key_tempo, minval=TEMPO[0], maxval=TEMPO[1])
-    return key, tempo, (block.R.T @ out, block.R.T @ along)
+    return key, tempo, (block.R.T @ out, block.R.T @ along)  # in the block: it tilts in the jaws
 
 
 def _following(script: handover.HandoverScript, state: EnvState) -> jax.Array:
@@ -78,16 +79,15 @@ def _goals(script: handover.HandoverScript, state: EnvState) -> tuple[jax.Array,
     block, tips = state.measurements.block, script.p
     wall, along = script.held
     out, along = block.R @ wall, block.R @ along
-    flat = out * jnp.array([1.0, 1.0, 0.0])
-    flat = flat / jnp.maximum(jnp.linalg.norm(flat), 1e-6)
-    normal = flat * jnp.where(flat[1] > 0, -1.0, 1.0)
+    flat = phases.horizontal(out)
+    normal = phases.towards_arm(flat)
     outside = handover.OUT * flat
     low = jnp.array([0.0, 0.0, -GRASP_DROP])
     give, take = (
         block.p + single.RIM_RADIUS * out + side * SIDE * along + low for side in (-1.0, 1.0)
     )
     park, up = jnp.array(PARK), jnp.array([0.0, 0.0, HOVER])
-    carried = tips[0] + jnp.array(PLACE) - block.p
+    carried = tips[0] + jnp.array(PLACE) - block.p  # moves the block to PLACE, not the tip
     # The taker's position once the block is upright over the target peg.
     tangent = jnp.array([-flat[1], flat[0]])
     aside = ((state.pose.p[1] - block.p)[:2] @ tangent) * tangent
@@ -96,21 +96,21 @@ def _goals(script: handover.HandoverScript, state: EnvState) -> tuple[jax.Array,
     held = tips
     goals = jnp.stack(
         [
-            jnp.stack([give + outside + up, park[1]]),
-            jnp.stack([give, park[1]]),
+            jnp.stack([give + outside + up, park[1]]),  # above
+            jnp.stack([give, park[1]]),  # down
             held,
-            held.at[0].add(up),
-            jnp.stack([carried, park[1]]),
-            jnp.stack([tips[0], take + outside + jnp.array(COME)]),
-            jnp.stack([tips[0], take]),
+            held.at[0].add(up),  # lift
+            jnp.stack([carried, park[1]]),  # carry
+            jnp.stack([tips[0], take + outside + jnp.array(COME)]),  # near
+            jnp.stack([tips[0], take]),  # meet
             held,
             held,
-            held.at[0].add(jnp.array(GO)),
-            jnp.stack([park[0], jnp.append(over, height + HOVER + OVER)]),
-            jnp.stack([park[0], jnp.append(over, height + RELEASE_HEIGHT)]),
+            held.at[0].add(jnp.array(GO)),  # away
+            jnp.stack([park[0], jnp.append(over, height + HOVER + OVER)]),  # over
+            jnp.stack([park[0], jnp.append(over, height + RELEASE_HEIGHT)]),  # lower
             held,
-            held.at[1].add(jnp.array(OFF)),
-            held.at[1, 2].set(jnp.clip(PARK[1][2], tips[1, 2], tips[1, 2] + phases.RISE)),
+            held.at[1].add(jnp.array(OFF)),  # rise
+            held.at[1, 2].set(jnp.clip(PARK[1][2], tips[1, 2], tips[1, 2] + phases.RISE)),  # wait
         ]
     )
     return goals, normal

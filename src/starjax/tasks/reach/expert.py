@@ -47,7 +47,7 @@ def init(key: jax.Array, state: EnvState) -> ReachScript:
     way = goal - start
     length = jnp.linalg.norm(way)
     across = jnp.cross(way, jnp.array([0.0, 0.0, 1.0]))
-    across = across / jnp.maximum(jnp.linalg.norm(across), 1e-6)
+    across = across / jnp.maximum(jnp.linalg.norm(across), 1e-6)  # zero for a vertical way
     side = jax.random.rademacher(key_side, (), jnp.float32) * BULGE * length * across
     tempo = jax.random.uniform(key_tempo, minval=TEMPO[0], maxval=TEMPO[1])
     duration = jnp.maximum(length / SPEED, LEAST_TIME) / tempo
@@ -61,9 +61,10 @@ def act(script: ReachScript, state: EnvState) -> tuple[Command, ReachScript, Com
     s = jnp.clip(elapsed / script.duration, 0.0, 1.0)
     fraction = scripting.sloped(s)
     p = script.start + fraction * (state.layout.p - script.start)
+    # A parabola, 1 at its middle: two ways around, so that demonstrations are bimodal.
     p = p + 4.0 * fraction * (1.0 - fraction) * script.side
     noise = scripting.disturb(script.key, script.noise, state.step, jnp.full(3, DEVIATION))
-    weight = jnp.clip((CALM - s) / CALM, 0.0, 1.0)
+    weight = jnp.clip((CALM - s) / CALM, 0.0, 1.0)  # undisturbed at the mark, where it must rest
     script = script.replace(elapsed=elapsed, noise=noise)
     return _command(p + weight * noise[1], state), script, _command(p, state)
 

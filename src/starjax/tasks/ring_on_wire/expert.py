@@ -64,17 +64,18 @@ def act(script: RingScript, state: EnvState) -> tuple[Command, RingScript, Comma
     after = _enter(script, _following(script, state), state)
     script, s = phases.advance(script, TIMING, after, state)
     fraction = scripting.sloped(s)
-    way = script.start + fraction * (script.goal - script.start)
+    way = script.start + fraction * (script.goal - script.start)  # [roll, p]
     # On the way down the tool has turned, and goes along its shaft, before it can touch.
     early = scripting.sloped(jnp.minimum(s / ALIGNED, 1.0))
     shaft = _shaft(script.goal[1:], state)
+    # Along the shaft, not straight down: a leaning shaft would sweep the wire.
     back = HOVER * (1.0 - fraction) * shaft
     aside = (1.0 - early) * (script.start + jnp.append(0.0, HOVER * shaft) - script.goal)
     way = jnp.where(script.phase == DESCEND, (script.goal + aside).at[1:].add(-back), way)
     noise = scripting.disturb(script.key, script.noise, state.step, jnp.array(DEVIATION))
     weights = jnp.asarray(DISTURBANCE)
     before, weight = weights[jnp.maximum(script.phase - 1, 0)], weights[script.phase]
-    moved = (before + fraction * (weight - before)) * jnp.roll(noise[1], 1)
+    moved = (before + fraction * (weight - before)) * jnp.roll(noise[1], 1)  # noise is [p, roll]
     script = script.replace(at=way, noise=noise)
     return _command(way + moved, script.jaws, state), script, _command(way, script.jaws, state)
 
@@ -82,10 +83,11 @@ def act(script: RingScript, state: EnvState) -> tuple[Command, RingScript, Comma
 def _following(script: RingScript, state: EnvState) -> jax.Array:
     """Returns the next phase: another carry, or the first one if the tab is not held."""
     is_carry, is_there = script.phase == CARRY, script.stop >= STOPS[-1] - 1e-6
+    # from stop to stop along the wire
     following = jnp.where(is_carry & ~is_there, CARRY, script.phase + 1)
     is_held = (script.phase >= LIFT) & (script.phase <= CARRY)
     following = jnp.where(is_held & ~state.measurements.touch, RAISE, following)
-    is_away = state.layout.way * state.measurements.ring.p[1] < task.END
+    is_away = state.layout.way * state.measurements.ring.p[1] < task.END  # it slid back: once more
     at_last = jnp.where(is_away, RAISE, WAIT)
     return jnp.where(script.phase >= LEAVE, at_last, following).astype(jnp.int32)
 
@@ -104,24 +106,26 @@ def _enter(script: RingScript, phase: jax.Array, state: EnvState) -> RingScript:
     shaft = _shaft(at_tab, state)
     normal = phases.towards_arm(ring.R[:, 1])
     above = at_tab - HOVER * shaft + jnp.array([0.0, HOVER_ASIDE, 0.0]) * side
-    progress = state.layout.way * ring.p[1]
+    progress = state.layout.way * ring.p[1]  # m towards the goal: `way` is the direction, +1 or -1
     stops = jnp.array(STOPS)
+    # The next stop well ahead of the ring: corrections of what was lost on the way come by
+    # themselves.
     following = jnp.min(jnp.where(stops > progress + AHEAD, stops, STOPS[-1]))
     stop = jnp.where(phase == LIFT, progress, jnp.where(phase == CARRY, following, script.stop))
     on_wire = _carrying(state.layout.way * stop, jnp.zeros(()), here[0], state)
     hung = _carrying(state.layout.way * stop, jnp.array(RELEASE), here[0], state)
     leaving = here.at[1:].add(-HOVER * _shaft(here[1:], state))
     goals = [
-        here.at[3].set(jnp.maximum(here[3], task.TIP_HOME[2])),
-        _turned(above, normal, here[0], state),
-        _turned(at_tab, normal, here[0], state),
+        here.at[3].set(jnp.maximum(here[3], task.TIP_HOME[2])),  # RAISE
+        _turned(above, normal, here[0], state),  # APPROACH
+        _turned(at_tab, normal, here[0], state),  # DESCEND
         here,
         on_wire,
         on_wire,
-        hung,
+        hung,  # LOWER
         here,
-        leaving,
-        here.at[3].set(jnp.clip(task.TIP_HOME[2], here[3], here[3] + phases.RISE)),
+        leaving,  # LEAVE
+        here.at[3].set(jnp.clip(task.TIP_HOME[2], here[3], here[3] + phases.RISE)),  # WAIT
     ]
     own = {"attempt": attempt, "side": side, "grasp": grasp, "stop": stop}
     return phases.enter(script, TIMING, phase, goals, **own)
@@ -137,20 +141,24 @@ def _carrying(y: jax.Array, lowered: jax.Array, roll: jax.Array, state: EnvState
     """
     point = jnp.stack([jnp.zeros(()), y, task.height(y) - lowered * task.HANG])
     rise = task.height(y + SMOOTHED) - task.height(y - SMOOTHED)
+    # The ring's plane stays across the wire: its normal is the wire's tangent, by a central
+    # difference.
     normal = -jnp.stack([jnp.zeros(()), jnp.array(2.0 * SMOOTHED), rise])
     held: Pose = jax.tree.map(lambda leaf: leaf[0], state.pose)
-    in_tool = held.R.T @ (state.measurements.ring.p - held.p)
+    in_tool = held.R.T @ (state.measurements.ring.p - held.p)  # p_tip_ring, as it was grasped
     way = jnp.append(roll, held.p)
+    # Fixed point: the roll depends on the tip, which depends on the roll through the grasp.
     for _ in range(ROUNDS):
         way = _turned(way[1:], normal, roll, state)
         R = _command(way, jnp.zeros(()), state).pose.R[0]
-        way = way.at[1:].set(point - R @ in_tool)
+        way = way.at[1:].set(point - R @ in_tool)  # puts the ring's centre on the wire
     return way
 
 
 def _turned(p: jax.Array, normal: jax.Array, roll: jax.Array, state: EnvState) -> jax.Array:
     """Returns roll and position `[4]` at `p`, jaws along `normal`, the roll nearest to `roll`."""
     R = _command(jnp.append(0.0, p), jnp.zeros(()), state).pose.R[0]
+    # turns the jaws' y axis to the normal
     turned = jnp.arctan2(-normal @ R[:, 0], normal @ R[:, 1])
     return jnp.append(scripting.nearer_half(turned, roll), p)
 

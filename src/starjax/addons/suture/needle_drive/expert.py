@@ -105,17 +105,8 @@ def enter(
     goals = [high, above, start.p, stays.p, stays.p]
     is_free = (phase == APPROACH) | (phase == DESCEND)
     turn = needles.turn_on(size, bite, state.measurements.needle, up)
-    script = phases.enter(
-        script,
-        TIMING,
-        phase,
-        goals,
-        attempt=script.attempt + (phase == APPROACH),
-        R_from=script.R,
-        R_goal=jnp.where(is_free, start.R, script.R),
-        turn=turn,
-        held=held,
-    )
+    R_goal = jnp.where(is_free, start.R, script.R)
+    script = wrist_script.enter(script, TIMING, phase, goals, R_goal, turn=turn, held=held)
     sweep = jnp.abs(_end(size, state) - turn) / TURN_SPEED / script.tempo
     return script.replace(duration=jnp.where(phase == DRIVE, sweep, script.duration))
 

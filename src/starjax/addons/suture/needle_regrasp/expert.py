@@ -74,15 +74,8 @@ def enter(script: WristScript, phase: jax.Array, state: EnvState) -> WristScript
         tip.at[2].set(jnp.clip(top, tip[2], tip[2] + phases.RISE)),
     ]
     is_free = (phase == APPROACH) | (phase == DESCEND)
-    return phases.enter(
-        script,
-        TIMING,
-        phase,
-        goals,
-        attempt=script.attempt + (phase == APPROACH),
-        R_from=script.R,
-        R_goal=jnp.where(is_free, grasp.R, script.R),
-    )
+    R_goal = jnp.where(is_free, grasp.R, script.R)
+    return wrist_script.enter(script, TIMING, phase, goals, R_goal)
 
 
 def _following(script: WristScript, state: EnvState) -> jax.Array:

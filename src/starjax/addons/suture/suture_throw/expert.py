@@ -117,14 +117,12 @@ def enter(script: ThrowScript, phase: jax.Array, state: EnvState) -> ThrowScript
     chosen = [goals.get(number, stays) for number in range(HOLD + 1)]
     turn = needles.turn_on(task.SIZE, bite, needle)
     turn = jnp.where(phase == OUT, task.turn_out(turn), turn)
-    script = phases.enter(
+    script = wrist_script.enter(
         script,
         TIMING,
         phase,
         [goal.p for goal in chosen],
-        attempt=script.attempt + (phase == APPROACH),
-        R_from=script.R,
-        R_goal=jnp.stack([goal.R for goal in chosen])[phase],
+        jnp.stack([goal.R for goal in chosen])[phase],
         turn=turn,
         turn_end=jnp.where(phase == OUT, jnp.where(leg == 0, middle, end + PAST), out),
         held=grip,

@@ -26,7 +26,6 @@ Examples:
   starjax view --policy compact --compare-with expert --trocar 3
   starjax view --policy compact --record runs/interventions"""
 
-_RENAMED = {"--beside": "--compare-with"}  # flags of the previous release
 Port = Annotated[int, Range(0, 65_535)]
 Show = Callable[[Any, Callable[[], bool]], str]  # (server, should_stop) -> a last line
 
@@ -62,7 +61,7 @@ class ViewArgs:
 
 def main(argv: Sequence[str]) -> int:
     """Serves the page until a stop."""
-    args = options.parse("view", ViewArgs, argv, DESCRIPTION, renamed=_RENAMED)
+    args = options.parse("view", ViewArgs, argv, DESCRIPTION)
     named = [name for name in ("policy", "run", "dataset", "trials") if getattr(args, name)]
     named += ["expert"] if args.expert else []
     if len(named) > 1:
