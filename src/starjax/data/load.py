@@ -83,7 +83,7 @@ def load(
     drawn = redraw.images_of(found, records, env) if found and is_drawn else {}
     fields = _fields(description, records[0], images and not drawn)
     total = sum(r["files"][file]["bytes"] for r in records for file in fields.values())
-    total += sum(math.prod(array.shape) for array in drawn.values())
+    total += sum(math.prod(array.shape) for array in drawn.values())  # uint8: a byte each
     place = place_for(total) if residency == "auto" else residency
     without = "" if images else " without images"
     where = whereabouts(place, bool(drawn))
@@ -205,7 +205,7 @@ def place_for(total: int) -> Residency:
     stats = device.memory_stats() or {}
     free = stats.get("bytes_limit", 2 * host) - stats.get("bytes_in_use", 0)
     if device.platform == "cpu":  # jax copies them within the same memory, for each device
-        free = HOST_SHARE * host / jax.local_device_count()
+        free = HOST_SHARE * host / jax.local_device_count()  # each virtual device has a copy
     # EpisodeArray pass through host memory on their way to the device.
     if total <= DEVICE_SHARE * free and total <= HOST_SHARE * host:
         return "device"
@@ -224,7 +224,7 @@ def _dataset(
     length, start = _spans(records)
     count = int(length.sum())
     rows = max(windows.padded_count(count), rows) if place == "device" else count
-    episode = np.repeat(np.arange(len(records), dtype=np.int32), length)
+    episode = np.repeat(np.arange(len(records), dtype=np.int32), length)  # frame -> demonstration
     fields, images = {}, {}
     for name, file in files_of.items():
         # Only images are large; everything else is read in any case.

@@ -43,7 +43,7 @@ class MinMax:
     reach: Any = None
 
     def normalize(self, x: jax.Array) -> jax.Array:
-        return (x - self.low) * (2.0 / (self.high - self.low)) - 1.0
+        return (x - self.low) * (2.0 / (self.high - self.low)) - 1.0  # [low, high] -> [-1, 1]
 
     def denormalize(self, x: jax.Array) -> jax.Array:
         return (x + 1.0) * (0.5 * (self.high - self.low)) + self.low
@@ -182,6 +182,7 @@ def _reach(
     def ends(command):
         def through(trocar):
             frame = rcm.trocar_frame(trocar, p_world_ref, roll_zero)
+            # the same tip through another trocar
             if wrist is None:
                 pose = rcm.project(command.pose, frame.p_world_trocar)
             else:
@@ -197,6 +198,8 @@ def _reach(
     # 2. union with [-1, 1]; rotations, rolls and wrists keep that range, whatever the trocar
     reach = np.stack([np.full(edge.shape[-1], -1.0), np.full(edge.shape[-1], 1.0)])
     counted = entries_but(space, task.arms, "R", "roll", "wrist")
+    # Relative coordinates of one tip differ by trocar: samples clipped to the training's box
+    # could not reach it through an unseen one.
     reach[0, counted] = np.minimum(edge[:, counted].min(axis=0), -1.0)
     reach[1, counted] = np.maximum(edge[:, counted].max(axis=0), 1.0)
     return jnp.asarray(reach, jnp.float32)

@@ -76,12 +76,13 @@ def split_holdout(
       `[F_train]` and `[F_holdout]` int32 frame numbers.
     """
     start, length = np.asarray(start), np.asarray(length)
-    count = min(holdout, len(start) // 4)
+    count = min(holdout, len(start) // 4)  # a small dataset keeps its demonstrations for training
     places = np.concatenate([np.asarray(field) for field in trocar.trocar], -1)
     place = np.unique(places, axis=0, return_inverse=True)[1].reshape(-1)
     left = np.bincount(place)
     kept_out = []
     for demo in ((np.arange(count) + 0.5) * len(start) / max(count, 1)).astype(int).tolist():
+        # A trocar that is trained nowhere else would make the error one of generalisation.
         if left[place[demo]] > 1:
             left[place[demo]] -= 1
             kept_out.append(demo)
@@ -96,7 +97,7 @@ def split_holdout(
 def strided(dataset: Dataset, frames: np.ndarray, stride: int) -> np.ndarray:
     """Returns every `stride`-th frame of each demonstration, of those given."""
     first = np.asarray(dataset.start)[np.asarray(dataset.episode)[frames]]
-    return frames[(frames - first) % stride == 0]
+    return frames[(frames - first) % stride == 0]  # counted from each demonstration's own start
 
 
 def observed_frames(dataset: Dataset, obs_horizon: int, stride: int) -> np.ndarray | None:
@@ -144,12 +145,13 @@ def window_frames(frame: Any, first: Any, last: Any, obs_horizon: int, horizon: 
     Returns:
       observed `[B, O]` and commanded `[B, H]` frame numbers.
     """
+    # One arithmetic for data on the device, inside jit, and for memory maps.
     np_ = jnp if isinstance(frame, jax.Array) else np
     observed = frame[:, None] + np.arange(1 - obs_horizon, 1, dtype=np.int32)
     commanded = frame[:, None] + np.arange(horizon, dtype=np.int32)
     return (
-        np_.maximum(observed, first[:, None]),
-        np_.minimum(commanded, last[:, None]),
+        np_.maximum(observed, first[:, None]),  # before the start: its first frame
+        np_.minimum(commanded, last[:, None]),  # after the end: its last command, a pose to hold
     )
 
 
@@ -178,7 +180,7 @@ def gather(dataset: Dataset, frame: Any, obs_horizon: int, horizon: int, seen: A
         observed = first[:, None] + seen.reshape(-1, obs_horizon)
 
     def take(tree, index):
-        flat = index.reshape(-1)
+        flat = index.reshape(-1)  # one gather a leaf, for all windows
         return jax.tree.map(
             lambda leaf: leaf[flat].reshape((*shape, *index.shape[1:], *leaf.shape[1:])),
             tree,
@@ -205,6 +207,7 @@ def over_frames(dataset: Dataset, frames: np.ndarray, fn: Callable[..., np.ndarr
     *per_frame, trocars, episode = low
     parts = []
     for i in range(0, len(frames), _CHUNK):
+        # full: one shape, one program
         frame = frames[np.minimum(np.arange(i, i + _CHUNK), len(frames) - 1)]
         observation, command = _take(per_frame, frame)
         part = np.asarray(fn(observation, command, _take(trocars, np.asarray(episode[frame]))))

@@ -59,17 +59,18 @@ def from_policy(
         weight, whole = weights(planned.command.gripper.shape[1], t)
 
         def added(total: jax.Array, plan: jax.Array) -> jax.Array:
-            later = jnp.concatenate([total[:, 1:], jnp.zeros_like(total[:, :1])], 1)
+            later = jnp.concatenate([total[:, 1:], jnp.zeros_like(total[:, :1])], 1)  # a step on
             return later + weight.reshape(-1, *[1] * (plan.ndim - 2)) * plan
 
         total = jax.tree.map(added, memory.total, planned.command)
-        mean = jax.tree.map(lambda x: x[:, 0] / whole, total)
+        mean = jax.tree.map(lambda x: x[:, 0] / whole, total)  # sum of w_i plan_i / sum of w_i
+        # A mean of rotations is none: Gram-Schmidt gives the nearest in its first column.
         pose = Pose(rcm.rot6d_decode(rcm.rot6d_encode(mean.pose.R)), mean.pose.p)
         angles, p_world_trocar = mean.wrist, state.measured_trocar.p_world_trocar
         if keeps_to_manifold and wrist is not None:
             pose, angles, _ = rcm.through(wrist, pose, p_world_trocar)
         elif keeps_to_manifold:
-            pose = rcm.project(pose, p_world_trocar)
+            pose = rcm.project(pose, p_world_trocar)  # means of poses on the manifold leave it
         now = Command(pose, mean.gripper, angles)
         return now, Memory(planned, total), now
 
@@ -79,6 +80,7 @@ def from_policy(
 def weights(horizon: int, t: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Returns the weights `[H]` of the plan of control step `t`, one per planned step, and the sum
     of the weights of all plans for the first of these steps."""
+    # older plans that reach this moment
     earlier = jnp.minimum(t, horizon - 1 - jnp.arange(horizon))
     each = jnp.exp(-DECAY * jnp.arange(horizon))
     return each[earlier], jnp.sum(jnp.where(jnp.arange(horizon) <= earlier[0], each, 0.0))

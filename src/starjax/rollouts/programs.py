@@ -15,7 +15,7 @@ from starjax.rcm.trocar import Trocar
 from starjax.rollouts import episodes, placement
 from starjax.rollouts.agent import BatchAgent
 from starjax.runtime import precompile
-from starjax.sim.state import Env, EnvParams
+from starjax.sim.state import Env, EnvParams, EnvState
 
 
 class Trials(NamedTuple):
@@ -44,7 +44,7 @@ class RolloutState(NamedTuple):
       active: `[N]` bool, see `Trials`.
     """
 
-    env: Env
+    env: EnvState
     memory: Any
     length: jax.Array
     active: jax.Array
@@ -111,12 +111,14 @@ def _programs(
 
 def _starter(env: _EnvFns, agent: _AgentFns) -> Callable[..., RolloutState]:
     def start_one(key: jax.Array, trials: Trials, levels: Any) -> tuple[Any, jax.Array]:
+        # The trial's own key: its lane and its neighbours have no part in it.
         key = jax.random.fold_in(jax.random.fold_in(key, trials.index), trials.trial)
         key_env, key_agent = jax.random.split(key)
         return env.reset(key_env, EnvParams(trials.trocar, levels=levels)), key_agent
 
     def start(key: jax.Array, params: Any, trials: Trials, levels: Any) -> RolloutState:
         state, keys = jax.vmap(start_one, in_axes=(None, 0, None))(key, trials, levels)
+        # A function: an agent that reads no observation costs no camera.
         memory = agent.init(params, keys, state, lambda: _of_all(env.observe)(state))
         return RolloutState(state, memory, jnp.zeros(trials.active.shape, jnp.int32), trials.active)
 
@@ -135,9 +137,10 @@ def _advancer(
         observed = observe(before) if record.observes else None
         look = (lambda: observe(before)) if observed is None else lambda: observed
         executed, memory, label = agent.act(params, carry.memory, before, look, t)
-        after = step_all(before, executed)
+        after = step_all(before, executed)  # all lanes, those that are over stand still
         made = episodes.Step(observed, label, executed, before, after, memory)
         fields = record.fields(made)
+        # ~done counts the step that ends an episode, and none after it.
         return RolloutState(after, memory, carry.length + ~before.done, carry.active), fields
 
     def advance(params: Any, carry: RolloutState, first: jax.Array) -> Any:
@@ -153,6 +156,7 @@ def _advancer(
 
         def is_running(loop):
             t, carry, _ = loop
+            # idle lanes do not keep it running
             return (t < last) & jnp.any(carry.active & ~carry.env.done)
 
         def body(loop):
@@ -175,7 +179,7 @@ def _of_all(observe: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _fields(
-    env: Env, record: episodes.Record, state: Any, memory: Any = None
+    env: _EnvFns, record: episodes.Record, state: EnvState, memory: Any = None
 ) -> dict[str, jax.Array]:
     """Records N episodes that stand still, for the shapes."""
     observed = _of_all(env.observe)(state) if record.observes else None
@@ -200,7 +204,7 @@ def _frame(env: _EnvFns, arms: int, record: episodes.Record) -> dict[str, jax.Sh
     return precompile.Program(one).shapes(jax.random.key(0))
 
 
-def status(env: Env, carry: RolloutState) -> dict[str, Any]:
+def status(env: _EnvFns, carry: RolloutState) -> dict[str, Any]:
     """Returns the status of N episodes: `over`, `length`, flags, `stage` and `labels`, `[N]`."""
     state = carry.env
     found = {

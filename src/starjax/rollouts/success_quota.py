@@ -50,7 +50,7 @@ def run(
     Raises:
       ExpertFailed: the expert fails too often.
     """
-    stored = set(results)
+    stored = set(results)  # are not yielded again
     drawn = [0] * trocars
     undecided: list[Episode] = []
 
@@ -75,6 +75,7 @@ def run(
         undecided.clear()  # superfluous episodes of the round before
         for ended in workers.run(share.mine(groups), simulate, max_workers, has_open_trial):
             undecided += ended
+            # Before the list is cleared, which frees the episodes' images.
             outcomes = {episode.trial: episode.outcome["success"] for episode in ended}
             ended.clear()
             yield from record({**poll_results(), **outcomes})

@@ -79,11 +79,13 @@ def _functions(
         update = functools.partial(progress.update, stalled_steps=limits.stalled)
         now, stalled = jax.vmap(update)(memory.progress, state)
         nearly_lost = jax.vmap(rescuer.nearly_lost)(state)
+        # Not while the success settles: a demonstration from there would teach to stay.
         late = (state.step >= limits.clock) & (state.settled == 0)
         number = progress.cause(stalled, late, nearly_lost)
-        number = jnp.where(memory.cause > 0, memory.cause, number)
+        number = jnp.where(memory.cause > 0, memory.cause, number)  # the first cause stays
         # The expert begins at this very state.
         begins = (number > 0) & (memory.cause == 0)
+        # Computed in every step: under vmap both sides of a condition run anyway.
         fresh = jax.vmap(rescuer.resume)(memory.key, state)
         script = _where(begins, fresh, memory.script)
         *theirs, script_after = _last(jax.vmap(rescuer.act)(script, state))

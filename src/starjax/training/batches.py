@@ -182,7 +182,7 @@ def choose(
     It reads the places of the episodes only, see `windows.places`.
     """
     count, keys = setup.train_config.batch_size, states.step_keys(key, step)
-    frame = windows.sample_frames(keys.batch, frames, count, available)
+    frame = windows.sample_frames(keys.batch, frames, count, available)  # with replacement
     levels = randomise.max_levels(setup.train_config)
     if not levels:
         return Choice(frame)
@@ -228,6 +228,7 @@ def disturbed(
     if choice.draws is None:
         return batch
     if displaced is not None:
+        # this step's, of several
         displaced = jax.tree.map(lambda x: x[:, displaced.index], displaced.images)
     names = list(randomise.max_levels(setup.train_config))
 

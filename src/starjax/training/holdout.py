@@ -38,7 +38,7 @@ def make(
     if len(frames) == 0:
         return None
     count = min(_WINDOWS, len(frames))
-    chosen = frames[(np.arange(count) * len(frames)) // count]
+    chosen = frames[(np.arange(count) * len(frames)) // count]  # evenly over the demonstrations
 
     def gather(data: windows.Dataset, frame: Any) -> windows.Batch:
         return windows.gather(data, frame, policy_config.obs_horizon, policy_config.horizon)
@@ -81,10 +81,10 @@ def action_errors(
     if wrist is not None:
         shafts = [_shaft(wrist, command, p_world_trocar) for command in (predicted, demonstrated)]
         trace = jnp.sum(predicted.pose.R * demonstrated.pose.R, axis=(-2, -1))
-        angle = jnp.arccos(jnp.clip((trace - 1.0) / 2.0, -1.0, 1.0))
+        angle = jnp.arccos(jnp.clip((trace - 1.0) / 2.0, -1.0, 1.0))  # trace R = 1 + 2 cos(angle)
         more = {"rotation_error_deg": jnp.rad2deg(jnp.mean(angle))}
     turn = rcm.roll_of(shafts[0].R) - rcm.roll_of(shafts[1].R)
-    turn = jnp.abs((turn + jnp.pi) % (2.0 * jnp.pi) - jnp.pi)
+    turn = jnp.abs((turn + jnp.pi) % (2.0 * jnp.pi) - jnp.pi)  # to [0, pi]
     return {
         "position_error_mm": 1e3 * jnp.mean(distance),
         "roll_error_deg": jnp.rad2deg(jnp.mean(turn)),

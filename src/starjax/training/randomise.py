@@ -109,13 +109,15 @@ def draw_levels(
     """
     is_on, fraction = jax.random.uniform(key, (2, len(highest)))
     redrawn = jnp.array([DISTURBANCES.get(name).redraws for name in highest])
+    # Images drawn anew are a fixed number, for one shape; all others are on by chance.
     is_on = jnp.where(redrawn, number < redrawn_count(share), is_on < PROBABILITY)
-    is_on &= number < disturbed_count(share)
+    is_on &= number < disturbed_count(share)  # the rest of the batch stays as recorded
     return jnp.where(is_on, fraction, 0.0) * jnp.array(list(highest.values()))
 
 
 def seen_steps(names: Sequence[str], draws: Draws, step: jax.Array, obs_horizon: int) -> jax.Array:
     """Returns the control steps `[B, O]` whose observations are seen at steps `[B]` and before."""
+    # [B, O]: t - O + 1 .. t
     window = jnp.maximum(step[:, None] + jnp.arange(1 - obs_horizon, 1), 0)
 
     def one(draws: Draws, steps: jax.Array) -> jax.Array:

@@ -72,7 +72,7 @@ def make(
     drawn: dict[int, dict[str, jax.Array]] = {}
 
     def of(key: jax.Array, step: int) -> Displaced:
-        first = step - step % count
+        first = step - step % count  # chunks are aligned to the step's number, wherever it began
         if first not in drawn:
             drawn.clear()
             drawn[first] = program(key, devices.replicate(np.int32(first), mesh), *data)
@@ -97,6 +97,7 @@ def draw_images(
     def chosen(step: jax.Array) -> batches.Choice:
         return batches.choose(setup, key, step, dataset, frames, available)
 
+    # The very draws of these steps' batches: the same keys, chosen twice.
     choice = jax.vmap(chosen, out_axes=1)(first + jnp.arange(count))  # [B, S]
     episode = dataset.episode[choice.frame]
     start = dataset.start[episode][..., None]

@@ -130,6 +130,8 @@ class StateLayout(NamedTuple):
         """Gathers parameters; each device gets the sum of its share of their gradient."""
         if self.mesh.size == 1:
             return params
+        # Its transpose is a reduce-scatter: gradients come out summed and shared out, without a
+        # line for it.
         gather = functools.partial(jax.lax.all_gather, axis_name=devices.AXIS, tiled=True)
         return jax.tree.map(
             lambda x, like: x if x.shape == like.shape else gather(x).reshape(like.shape),
@@ -153,8 +155,8 @@ class StateLayout(NamedTuple):
                 summed,
                 shapes,
             )
-        summed = jax.tree.map(lambda g, like: g.astype(like.dtype), summed, shapes)
-        return jax.tree.map(lambda g: g / count, summed) if count > 1 else summed
+        summed = jax.tree.map(lambda g, like: g.astype(like.dtype), summed, shapes)  # float32 again
+        return jax.tree.map(lambda g: g / count, summed) if count > 1 else summed  # sum -> mean
 
     def norm(self, gradients: Any) -> jax.Array:
         """Returns the Euclidean norm of all gradients."""
@@ -207,6 +209,7 @@ class Setup(NamedTuple):
 def _rounded(leaves: list[jax.Array], types: tuple[Any, ...]) -> list[jax.Array | None]:
     """Returns the leaves whose type changes, None for the others."""
     pairs = zip(leaves, types, strict=True)
+    # None: not kept twice
     return [None if x.dtype == dtype else x.astype(dtype) for x, dtype in pairs]
 
 

@@ -50,6 +50,7 @@ def streams(seed: int) -> Streams:
 
 def step_keys(key: jax.Array, step: jax.Array) -> StepKeys:
     """Derives the keys of a step from those of all steps."""
+    # A function of the step's number: a resumed training draws on as if it had not stopped.
     return StepKeys(*jax.random.split(jax.random.fold_in(key, step)))
 
 
@@ -80,7 +81,7 @@ class TrainState:
 
 def learning_rate(train_config: config.TrainConfig) -> optax.Schedule:
     """Returns linear warm-up, then half a cosine down to zero."""
-    warmup = min(train_config.warmup_steps, train_config.steps // 2)
+    warmup = min(train_config.warmup_steps, train_config.steps // 2)  # short trainings warm up, too
     return optax.warmup_cosine_decay_schedule(
         init_value=0.0,
         peak_value=train_config.learning_rate,
@@ -92,7 +93,8 @@ def learning_rate(train_config: config.TrainConfig) -> optax.Schedule:
 def make_optimizer(train_config: config.TrainConfig) -> optax.GradientTransformation:
     """Returns AdamW with Diffusion Policy's betas; the roll network's kernels may decay faster."""
     parts = [
-        optax.scale_by_adam(b1=0.95, b2=0.999),
+        optax.scale_by_adam(b1=0.95, b2=0.999),  # as Diffusion Policy
+        # decoupled: after the moments (AdamW)
         optax.add_decayed_weights(train_config.weight_decay),
     ]
     if train_config.roll_weight_decay:
@@ -174,7 +176,7 @@ def create(
     return TrainState(
         step=jnp.int32(0),
         params=params,
-        ema_params=jax.tree.map(jnp.copy, params),
+        ema_params=jax.tree.map(jnp.copy, params),  # own memory: steps donate both
         opt_state=optimizer.init(params),
         normalizer=stats,
         key=key,

@@ -37,6 +37,7 @@ def resident_steps(
       count: int32 `[]`, traced: logging and checkpoints may stop anywhere without another
         compilation.
     """
+    # The count is traced: a loop of any length is the same program.
     return jax.lax.fori_loop(
         0, count, lambda _, carry: resident_step(setup, carry, dataset, frames, available), carry
     )
@@ -70,6 +71,7 @@ def _update(setup: Setup, carry: StepCarry, prepared: Any) -> StepCarry:
     """Takes one step on a device's share of a prepared batch."""
     layout, state = setup.layout, carry.state
     # 1. Gradient of the batch, whose shares the devices average.
+    # L of Eq. 15 for the paper's method.
     (loss, metrics), gradients = jax.value_and_grad(
         lambda params: setup.policy.loss(layout.gather_params(params), prepared), has_aux=True
     )(layout.params(carry))
@@ -79,15 +81,18 @@ def _update(setup: Setup, carry: StepCarry, prepared: Any) -> StepCarry:
     finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(norm)
     # zeros instead of NaN keep the arithmetic below harmless; its results are dropped
     gradients = jax.tree.map(lambda g: jnp.where(finite, g, 0.0), gradients)
+    # 2. AdamW
     updates, opt_state = setup.optimizer.update(gradients, state.opt_state, state.params)
     params = optax.apply_updates(state.params, updates)
     decay = states.ema_decay(state.step, setup.train_config.ema_max)
+    # 3. theta_ema <- decay theta_ema + (1 - decay) theta: the weights that act.
     ema_params = optax.incremental_update(params, state.ema_params, 1.0 - decay)
 
     metrics["gradient_norm"] = norm
     sums = states.add_metrics(state.sums, metrics, finite)
 
     def keep(new: Any, old: Any) -> Any:
+        # Selected leaf by leaf, without a branch: a condition would copy the whole state.
         return jax.tree.map(functools.partial(jax.lax.select, finite), new, old)
 
     state = state.replace(

@@ -37,6 +37,35 @@ def opposite(mount: Mount) -> Mount:
     return mount._replace(position=(-x, -y, z), yaw=yaw)
 
 
+def mounts(
+    board: Mount,
+    tissue: Mount,
+    *,
+    wrist: Mount | None = None,
+    wire: Mount | None = None,
+    left: Mount | None = None,
+    right: Mount | None = None,
+) -> dict[tuple[str, str], Mount]:
+    """Returns `Arm.mounts` of an arm that serves every workspace.
+
+    Args:
+      board: mount for straight tools, and in place of those that are not passed.
+      tissue: mount for endoscopes.
+      wrist: mount for tools with a wrist at the board.
+      wire: mount at the wire.
+      left, right: mounts at either side of the board; the right one is opposite the left one.
+    """
+    left = left or board
+    sides = {"left": left, "right": right or opposite(left)}
+    return {
+        ("grasper", "board"): board,
+        **dict.fromkeys([("needle_driver", "board"), ("prograsp", "board")], wrist or board),
+        ("grasper_wide", "wire"): wire or board,
+        **{(tool, side): sides[side] for side in sides for tool in ("grasper", "needle_driver")},
+        **dict.fromkeys([("endoscope", "tissue"), ("endoscope30", "tissue")], tissue),
+    }
+
+
 class Arm(NamedTuple):
     """One arm, a row of the registry.
 

@@ -2,7 +2,7 @@
 
 import math
 
-from starjax.sim.arms.base import Arm, Mount
+from starjax.sim.arms.base import Arm, Mount, mounts
 
 _BOARD = Mount(
     position=(-0.58, 0.0, 0.20),
@@ -24,16 +24,5 @@ ARM = Arm(
     joints=("j1", "j2", "j3", "j4", "j5", "j6"),
     max_speed=(3.15,) * 6,  # the slower joints of the data sheet
     servo_frequency=100.0,
-    mounts={
-        ("grasper", "board"): _BOARD,
-        ("needle_driver", "board"): _BOARD,
-        ("prograsp", "board"): _BOARD,
-        ("grasper_wide", "wire"): _BOARD,
-        # Two arms at either side of the board.
-        ("grasper", "left"): _BOARD,
-        ("needle_driver", "left"): _BOARD,
-        ("grasper", "right"): _RIGHT,
-        ("needle_driver", "right"): _RIGHT,
-        **dict.fromkeys([("endoscope", "tissue"), ("endoscope30", "tissue")], _TISSUE),
-    },
+    mounts=mounts(_BOARD, _TISSUE, right=_RIGHT),
 )

@@ -4,7 +4,7 @@ Upright it does not reach every trocar: its elbow bends by 120 degrees at most, 
 then be nowhere near the shoulder. It hangs from a column, tilted by two thirds of a half turn.
 """
 
-from starjax.sim.arms.base import Arm, Mount, opposite
+from starjax.sim.arms.base import Arm, Mount, mounts
 
 _MOUNT = Mount(
     position=(-0.444, 0.159, 1.15),
@@ -29,17 +29,7 @@ ARM = Arm(
     joints=("j1", "j2", "j3", "j4", "j5", "j6", "j7"),
     max_speed=(1.484, 1.484, 1.745, 1.309, 2.269, 2.356, 2.356),
     servo_frequency=100.0,
-    mounts={
-        ("grasper", "board"): _MOUNT,
-        ("needle_driver", "board"): _MOUNT,
-        ("prograsp", "board"): _MOUNT,
-        ("grasper_wide", "wire"): _MOUNT,
-        ("grasper", "left"): _MOUNT,
-        ("needle_driver", "left"): _MOUNT,
-        ("grasper", "right"): opposite(_MOUNT),
-        ("needle_driver", "right"): opposite(_MOUNT),
-        **dict.fromkeys([("endoscope", "tissue"), ("endoscope30", "tissue")], _TISSUE),
-    },
+    mounts=mounts(_MOUNT, _TISSUE),
     rest_gain=0.1,
     link_radius=0.06,
 )

@@ -1,6 +1,6 @@
 """Franka Emika Panda: seven joints, 3 kg. Figures from the maker's documentation."""
 
-from starjax.sim.arms.base import Arm, Mount, opposite
+from starjax.sim.arms.base import Arm, Mount, mounts
 
 _LEFT = Mount(
     position=(-0.422, -0.006, -0.399),
@@ -36,17 +36,7 @@ ARM = Arm(
     joints=("j1", "j2", "j3", "j4", "j5", "j6", "j7"),
     max_speed=(2.175,) * 4 + (2.61,) * 3,
     servo_frequency=100.0,
-    mounts={
-        ("grasper", "board"): _BOARD,
-        ("needle_driver", "board"): _BOARD,
-        ("prograsp", "board"): _BOARD,
-        ("grasper_wide", "wire"): _WIRE,
-        ("grasper", "left"): _LEFT,
-        ("needle_driver", "left"): _LEFT,
-        ("grasper", "right"): opposite(_LEFT),
-        ("needle_driver", "right"): opposite(_LEFT),
-        **dict.fromkeys([("endoscope", "tissue"), ("endoscope30", "tissue")], _TISSUE),
-    },
+    mounts=mounts(_BOARD, _TISSUE, wire=_WIRE, left=_LEFT),
     rest_gain=0.1,
     link_radius=0.055,
     watched=4,  # its base and elbow are below the table top, next to the table

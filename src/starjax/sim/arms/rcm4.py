@@ -6,7 +6,7 @@ commanded off the RCM manifold it does not follow.
 
 import math
 
-from starjax.sim.arms.base import Arm, Mount, opposite
+from starjax.sim.arms.base import Arm, Mount, mounts
 
 # Yaw turns about the world's y axis, where the shaft leans furthest.
 _BOARD = Mount(position=(0.0, 0.0, 0.0), yaw=-math.pi / 2, turn=0.0, home=(0.0, 0.0, 0.11, 0.0))
@@ -33,17 +33,7 @@ ARM = Arm(
     joints=("yaw", "pitch", "insertion", "roll"),
     max_speed=(1.0, 1.0, 0.2, 8.0),  # as in published work with the dVRK
     servo_frequency=100.0,
-    mounts={
-        ("grasper", "board"): _BOARD,
-        ("needle_driver", "board"): _WRIST,
-        ("prograsp", "board"): _WRIST,
-        ("grasper_wide", "wire"): _WIRE,
-        ("grasper", "left"): _LEFT,
-        ("needle_driver", "left"): _LEFT,
-        ("grasper", "right"): opposite(_LEFT),
-        ("needle_driver", "right"): opposite(_LEFT),
-        **dict.fromkeys([("endoscope", "tissue"), ("endoscope30", "tissue")], _TISSUE),
-    },
+    mounts=mounts(_BOARD, _TISSUE, wrist=_WRIST, wire=_WIRE, left=_LEFT),
     link_radius=0.02,
     remote_centre=True,
 )

@@ -2,7 +2,7 @@
 
 import math
 
-from starjax.sim.arms.base import Arm, Mount, opposite
+from starjax.sim.arms.base import Arm, Mount, mounts
 
 _MOUNT = Mount(
     position=(-0.566, 0.075, 0.409),
@@ -24,15 +24,5 @@ ARM = Arm(
     joints=("j1", "j2", "j3", "j4", "j5", "j6"),
     max_speed=(math.pi,) * 6,
     servo_frequency=100.0,
-    mounts={
-        ("grasper", "board"): _MOUNT,
-        ("needle_driver", "board"): _MOUNT,
-        ("prograsp", "board"): _MOUNT,
-        ("grasper_wide", "wire"): _MOUNT,
-        ("grasper", "left"): _MOUNT,
-        ("needle_driver", "left"): _MOUNT,
-        ("grasper", "right"): opposite(_MOUNT),
-        ("needle_driver", "right"): opposite(_MOUNT),
-        **dict.fromkeys([("endoscope", "tissue"), ("endoscope30", "tissue")], _TISSUE),
-    },
+    mounts=mounts(_MOUNT, _TISSUE),
 )
