@@ -103,7 +103,7 @@ def checked(**named: tuple[Any, tuple[int, ...]]) -> list[jax.Array]:
         if hasattr(value, "_fields"):
             raise ValueError(f"{name}: expected an array, got {type(value).__name__}")
     values = {name: jnp.asarray(value) for name, (value, _) in named.items()}
-    leading = {}
+    leading = {}  # axes before the trailing ones
     for name, (_, trailing) in named.items():
         shape, n = values[name].shape, len(trailing)
         if len(shape) < n or shape[len(shape) - n :] != trailing:
@@ -131,7 +131,7 @@ def taint(x: jax.Array) -> jax.Array:
 
     A constant NaN would trip `jax_debug_nans` even for finite inputs.
     """
-    return jnp.sum(x - x, axis=-1, keepdims=True)
+    return jnp.sum(x - x, axis=-1, keepdims=True)  # x - x is 0, or NaN for NaN and infinity
 
 
 def epsilon(dtype: Any) -> float:
@@ -156,7 +156,7 @@ def direction(v: jax.Array, fallback: ArrayLike) -> tuple[jax.Array, jax.Array]:
     scale = jax.lax.stop_gradient(jnp.max(jnp.abs(v), axis=-1, keepdims=True))
     is_defined = scale > epsilon(v.dtype)
     scaled = jnp.where(is_defined, v / jnp.where(is_defined, scale, 1.0), fallback)
-    length = jnp.sqrt(dot(scaled, scaled))
+    length = jnp.sqrt(dot(scaled, scaled))  # entries of order one: no overflow, no underflow
     return scaled / length, jnp.where(is_defined, scale * length, 0.0)[..., 0]
 
 

@@ -85,6 +85,7 @@ def trocar_from_poses(
     axis = R[..., :, 2]
     is_known = jnp.isfinite(axis).all(-1) & (jnp.abs(p) <= _FARTHEST).all(-1)
     axis, length = arrays.direction(arrays.bounded(axis), np.array([0.0, 0.0, -1.0], np.float32))
+    # a rotation's column has length 1
     known = (is_known & (length > 0.5) & (length < 2.0)).astype(p.dtype)
     centre = _median(p, known)
     # Positions relative to the centre keep more digits in float32.
@@ -98,6 +99,7 @@ def trocar_from_poses(
     def better(_: int, point: jax.Array) -> jax.Array:
         return _step(point, axis, p, _weight(_distance(point, axis, p), known))
 
+    # robust start: sum of distances
     point = jax.lax.fori_loop(0, _COARSE, nearer, jnp.zeros_like(centre))
     point = jax.lax.fori_loop(0, _FINE, better, point)
     weight = _weight(_distance(point, axis, p), known)
@@ -107,7 +109,7 @@ def trocar_from_poses(
     weight = jnp.where(is_plain[..., None], known, weight)
     distance, count = _distance(point, axis, p), jnp.sum(weight, -1)
     total = jnp.sum(weight * distance**2, -1)
-    residual = jnp.sqrt(jnp.maximum(total / jnp.maximum(count, 1.0), 1e-30))
+    residual = jnp.sqrt(jnp.maximum(total / jnp.maximum(count, 1.0), 1e-30))  # m, root mean square
     is_straight = residual <= MAX_RESIDUAL
     is_determined = _is_spread(axis, weight) & is_straight
     variance = total / jnp.maximum(2.0 * count - 3.0, 1.0)  # a line fixes two coordinates
@@ -115,6 +117,7 @@ def trocar_from_poses(
     safe = jnp.where(is_determined[..., None, None], _normal(axis, weight), eye)
     # A constant NaN would trip `jax_debug_nans` for every estimate.
     unknown = jax.lax.stop_gradient(jnp.zeros_like(count) / is_determined.astype(count.dtype))
+    # s^2 (sum w N)^-1
     covariance = (variance / jnp.maximum(count, 1.0))[..., None, None] * _inverse(safe)
     return TrocarEstimate(
         p_world_trocar=jnp.where(is_determined[..., None], centre + point, unknown[..., None]),
@@ -158,7 +161,7 @@ def _step(point: jax.Array, axis: jax.Array, p: jax.Array, weight: jax.Array) ->
     """
     off = _off(point, axis, p)
     scale = jnp.maximum(jnp.sum(weight, -1), 1e-30)[..., None]
-    towards = jnp.sum(weight[..., None] * off, -2) / scale
+    towards = jnp.sum(weight[..., None] * off, -2) / scale  # minus the gradient / 2
     # The damping keeps the point along parallel lines, the arbitrary direction.
     damped = _normal(axis, weight) + _DAMPING * jnp.eye(3, dtype=p.dtype)
     return jnp.clip(point + arrays.matvec(_inverse(damped), towards), -1e4, 1e4)
@@ -168,7 +171,7 @@ def _inverse(symmetric: jax.Array) -> jax.Array:
     """Inverts a positive `[..., 3, 3]`; jax's own inverse fails under its error checks."""
     x, y, z = (symmetric[..., i] for i in range(3))
     adjugate = jnp.stack([jnp.cross(y, z), jnp.cross(z, x), jnp.cross(x, y)], axis=-2)
-    return adjugate / arrays.dot(x, adjugate[..., 0, :])[..., None]
+    return adjugate / arrays.dot(x, adjugate[..., 0, :])[..., None]  # adj A / det A
 
 
 def _normal(axis: jax.Array, weight: jax.Array) -> jax.Array:
@@ -176,13 +179,13 @@ def _normal(axis: jax.Array, weight: jax.Array) -> jax.Array:
     scale = jnp.maximum(jnp.sum(weight, -1), 1e-30)[..., None, None]
     outer = axis[..., :, None] * axis[..., None, :]
     spanned = jnp.sum(weight[..., None, None] * outer, -3) / scale
-    return jnp.eye(3, dtype=axis.dtype) - spanned
+    return jnp.eye(3, dtype=axis.dtype) - spanned  # projects across the lines
 
 
 def _off(point: jax.Array, axis: jax.Array, p: jax.Array) -> jax.Array:
     """Returns the vectors `[..., T, 3]` m from the point to the nearest position on each line."""
     away = p - point[..., None, :]
-    return away - arrays.dot(away, axis) * axis
+    return away - arrays.dot(away, axis) * axis  # the part across the line
 
 
 def _distance(point: jax.Array, axis: jax.Array, p: jax.Array) -> jax.Array:
@@ -193,6 +196,7 @@ def _weight(distance: jax.Array, known: jax.Array) -> jax.Array:
     """Returns Tukey's weights, scaled by the median distance of known lines."""
     middle = _median(distance[..., None], known)
     deviation = jax.lax.stop_gradient(jnp.maximum(middle / _RAYLEIGH, _FINEST))
+    # zero weight for outliers
     inside = jnp.maximum(1.0 - (distance / (_CUT * deviation)) ** 2, 0.0)
     return known * inside**2
 

@@ -82,6 +82,7 @@ def tip_of(wrist: Wrist, pose_world_shaft: Pose, angles: ArrayLike) -> Pose:
     wrist_checks.check_wrist(wrist)
     R, p, angles = _checked(pose_world_shaft, angles=(angles, (2,)))
     bend = bent(wrist, angles)
+    # T_world_tip = T_world_shaft T_shaft_tip
     return Pose(arrays.matmul(R, bend.R), p + arrays.matvec(R, bend.p))
 
 
@@ -97,7 +98,7 @@ def shaft_of(wrist: Wrist, pose_world_tip: Pose, angles: ArrayLike) -> Pose:
     wrist_checks.check_wrist(wrist)
     R, p, angles = _checked(pose_world_tip, angles=(angles, (2,)))
     bend = bent(wrist, angles)
-    R = arrays.matmul(R, bend.R.mT)
+    R = arrays.matmul(R, bend.R.mT)  # R_world_shaft = R_world_tip R_shaft_tip'
     return Pose(R, p - arrays.matvec(R, bend.p))
 
 
@@ -151,7 +152,7 @@ def through(wrist: Wrist, pose_world_tip: Pose, p_world_trocar: ArrayLike) -> Wr
     deep = _angles(wrist, R, jnp.maximum(length, least)[..., None] * line)
     angles = limited(wrist, jnp.where(is_feasible[..., None], angles, deep))
     bend = bent(wrist, angles)
-    depth, _ = tip_depth(bend, length)
+    depth, _ = tip_depth(bend, length)  # of the tip, along the shaft
     # 1. Any shaft whose tip lies on the line: the least turn of the target's.
     R_shaft = arrays.matmul(R, bend.R.mT)
     toward_tip = arrays.matvec(R_shaft, tip_direction(bend, depth))
@@ -182,8 +183,9 @@ def bent(wrist: Wrist, angles: jax.Array) -> Pose:
         [-sin_pitch, cos_pitch * sin_yaw, cos_pitch * cos_yaw],
     )
     R = jnp.stack([jnp.stack(row, -1) for row in rows], -2)
+    # direction from the pitch to the yaw axis, in {L}
     clevis = jnp.stack([sin_pitch, zero, cos_pitch], -1)
-    return Pose(R, wrist.clevis * clevis + wrist.jaws * R[..., :, 2])
+    return Pose(R, wrist.clevis * clevis + wrist.jaws * R[..., :, 2])  # R = R_y(pitch) R_x(yaw)
 
 
 def limited(wrist: Wrist, angles: jax.Array) -> jax.Array:
@@ -200,7 +202,7 @@ def tip_depth(bend: Pose, length: jax.Array) -> tuple[jax.Array, jax.Array]:
     across2 = arrays.dot(bend.p[..., :2], bend.p[..., :2])[..., 0]
     least = bend.p[..., 2] + manifold.MIN_DEPTH  # depth of W
     length = jnp.minimum(length, 2.0 * manifold.MAX_DEPTH)  # huge squares overflow
-    room = length**2 - across2
+    room = length**2 - across2  # Pythagoras: the tip's part along the shaft
     depth = jnp.sqrt(jnp.maximum(room, least**2))
     is_reached = (room >= least**2) & (depth <= manifold.MAX_DEPTH)
     return jnp.minimum(depth, manifold.MAX_DEPTH), is_reached
@@ -222,7 +224,7 @@ def _is_feasible(wrist: Wrist, angles: jax.Array, length: jax.Array) -> tuple[ja
 
 def shaft_at(R: jax.Array, depth: jax.Array, bend: Pose, p_world_trocar: jax.Array) -> Pose:
     """Returns the shaft through the trocar with a tip at a depth along it."""
-    insertion = depth - bend.p[..., 2]
+    insertion = depth - bend.p[..., 2]  # of W, the pitch axis
     return Pose(R, p_world_trocar + insertion[..., None] * R[..., :, 2])
 
 
@@ -235,9 +237,12 @@ def _angles(wrist: Wrist, R: jax.Array, offset: jax.Array) -> jax.Array:
     """
     x, y, z = (R[..., :, i] for i in range(3))
     v = offset - wrist.jaws * z
-    along = arrays.dot(v, x)
-    u, across = arrays.direction(v - along * x, z)
+    along = arrays.dot(v, x)  # part along the yaw axis: only the pitch makes it
+    u, across = arrays.direction(v - along * x, z)  # the clevis' direction, orthogonal to x
+    # In the plane of x and u the shaft runs from the trocar to the pitch axis, `clevis` before
+    # the end of v.
     pitch = _arctan2(-along[..., 0], across - wrist.clevis)
+    # from u to the jaws' z, about x
     yaw = _arctan2(arrays.dot(u, y)[..., 0], arrays.dot(u, z)[..., 0])
     return jnp.stack([pitch, yaw], -1)
 
@@ -251,6 +256,7 @@ def _arctan2(y: jax.Array, x: jax.Array) -> jax.Array:
 def _best_turn(A: jax.Array, line: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Returns cosine and sine `[...]` of the turn about `line` that brings `A` nearest to I."""
     skew = jnp.stack([A[..., i, j] - A[..., j, i] for i, j in ((1, 2), (2, 0), (0, 1))], -1)
+    # tr(turn A) = cos (tr A - n A n) + sin (n . skew A) + constant: greatest at their angle.
     cos = jnp.trace(A, axis1=-2, axis2=-1) - arrays.dot(line, arrays.matvec(A, line))[..., 0]
     sin = arrays.dot(line, skew)[..., 0]
     fallback = np.array([1.0, 0.0, 0.0], np.float32)
@@ -265,7 +271,7 @@ def _about(axis: jax.Array, cos: jax.Array, sin: jax.Array) -> jax.Array:
     K = jnp.stack([jnp.stack(row, -1) for row in ([zero, -z, y], [z, zero, -x], [-y, x, zero])], -2)
     cos, sin = cos[..., None, None], sin[..., None, None]
     outer = axis[..., :, None] * axis[..., None, :]
-    return cos * jnp.eye(3, dtype=axis.dtype) + sin * K + (1.0 - cos) * outer
+    return cos * jnp.eye(3, dtype=axis.dtype) + sin * K + (1.0 - cos) * outer  # Rodrigues
 
 
 def _rotation(R: jax.Array) -> jax.Array:

@@ -35,10 +35,11 @@ def rcm6(wrist: wrists.Wrist) -> actions.ActionSpace:
     def encode(pose: Pose, frame: actions.SpaceFrame) -> list[jax.Array]:
         angles = wrists.angles_through(wrist, pose, frame.p)
         shaft = wrists.shaft_of(wrist, pose, angles)
+        # (gamma, pitch, yaw, p_abs)
         return [actions.roll_from_zero(shaft.R, frame), angles, pose.p]
 
     def decode(parts: dict[str, jax.Array], frame: actions.SpaceFrame) -> Pose:
-        angles = wrists.limited(wrist, parts["wrist"])
+        angles = wrists.limited(wrist, parts["wrist"])  # total: any numbers give a feasible wrist
         bend = wrists.bent(wrist, angles)
         offset = parts["p"] - frame.p
         line, length = arrays.direction(offset, -_E_Z)
@@ -46,6 +47,8 @@ def rcm6(wrist: wrists.Wrist) -> actions.ActionSpace:
         roll = parts["roll"][..., 0] + frame.roll_zero
         # R_world_shaft = G align(e_z, a) Rz(roll) as in Alg. 1, where `align` turns about a
         # horizontal axis. It must take the rolled tip's direction to the line from trocar to tip.
+        # With the roll fixed the tip's direction in {L} is known; the axis must turn it onto the
+        # line.
         tip = arrays.matvec(rotations.rotation_z(roll), wrists.tip_direction(bend, depth))
         axis = _turned_z(*jnp.broadcast_arrays(tip, line * _G))
         R = rotations.rotation_from_axis_roll(axis * _G, roll)
@@ -134,8 +137,9 @@ def _turned_z(a: jax.Array, b: jax.Array) -> jax.Array:
     """
     n = jnp.stack([a[..., 1] - b[..., 1], b[..., 0] - a[..., 0], jnp.zeros_like(a[..., 0])], -1)
     n, _ = arrays.direction(n, _E_X)
-    a, b = (x - arrays.dot(x, n) * n for x in (a, b))
+    a, b = (x - arrays.dot(x, n) * n for x in (a, b))  # across n, where the turn is seen
     turn = jnp.concatenate([arrays.dot(a, b), arrays.dot(n, jnp.cross(a, b))], -1)
     turn, _ = arrays.direction(turn, _E_X[:2])
     cos, sin = turn[..., :1], turn[..., 1:]
+    # n is horizontal
     return cos * _E_Z.astype(a.dtype) + sin * jnp.cross(n, jnp.broadcast_to(_E_Z, n.shape))

@@ -20,15 +20,18 @@ def move(scene: scenes.Scene, a: int, state: EnvState, command: Command):
     bound, p_trocar = scene.arms[a], state.trocar.p_world_trocar[a]
     q_target, last_correction = state.q_target[a], state.correction[a]
     chain = scenes.chain_at(bound, p_trocar)
-    reference, _, _ = ik.forward(chain, q_target)
+    reference, _, _ = ik.forward(chain, q_target)  # where the target is, not the lagging arm
+    # Without the correction for load: the reference must not drift with it.
     present = control.corrected(reference, p_trocar, -last_correction)
     measured = state.pose if state.shaft is None else state.shaft
+    # integral feedback
     correction = control.correct(last_correction, of(measured, a), present, p_trocar)
     wanted = carried_by(bound, command)
     if bound.tool.wrist is None:
         target, velocity = control.toward(
             present, state.velocity[a], wanted, p_trocar, 1.0 / CONTROL_HZ
         )
+        # turned about the tip, against the load
         ik_target = control.corrected(target, p_trocar, correction)
         q, _ = solve(bound, p_trocar, ik_target, q_target, STEP_IK_ITERATIONS)
     else:
@@ -44,9 +47,10 @@ def move(scene: scenes.Scene, a: int, state: EnvState, command: Command):
         q, _ = solve(bound, p_trocar, ik_target, q_target[: bound.joints], STEP_IK_ITERATIONS)
         q = jnp.concatenate([q, angles])
     usable = _is_usable(command) & jnp.all(jnp.isfinite(q))
+    # An unusable command holds the arm: it never moves on a doubt.
     dq = jnp.where(usable, q - q_target, 0.0)
     fastest = jnp.maximum(jnp.max(jnp.abs(dq) / bound.max_speed), 1e-9)
-    dq = dq * jnp.minimum(1.0, 1.0 / CONTROL_HZ / fastest)
+    dq = dq * jnp.minimum(1.0, 1.0 / CONTROL_HZ / fastest)  # the slowest joint sets the pace of all
     goal = control.corrected(wanted, p_trocar, correction)
     return (
         dq,
@@ -129,6 +133,7 @@ def _is_usable(command: Command) -> jax.Array:
     """Returns True if the command is finite and its R a rotation."""
     finite = jax.tree.map(lambda x: jnp.all(jnp.isfinite(x)), command)
     R = command.pose.R
-    skew = jnp.max(jnp.abs(R.T @ R - jnp.eye(3)))
+    skew = jnp.max(jnp.abs(R.T @ R - jnp.eye(3)))  # R' R = I for a rotation
+    # det R > 0: no mirror
     is_rotation = (skew < MAX_SKEW) & (jnp.cross(R[:, 0], R[:, 1]) @ R[:, 2] > 0)
     return jax.tree.reduce(jnp.logical_and, finite) & is_rotation

@@ -92,13 +92,15 @@ def _with_scene(
     """Yields overlaps of each arm with the table, the floor and the obstacles."""
     for a, bound in enumerate(arms):
         tool, axis = bound.tool, carried.R[a, :, 2]
+        # m from the tip up
         along = tool.shaft_end + jnp.linspace(0.0, tool.shaft_reach, SHAFT_POINTS)
         shaft = carried.p[a] - along[:, None] * axis
         watched = origins[a][bound.arm.watched :, 2]
-        end = pose.p[a, 2] + tool.pad_end * pose.R[a, :, 2][2]
+        end = pose.p[a, 2] + tool.pad_end * pose.R[a, :, 2][2]  # height of the pads' ends
         yield f"arm {a}: links, table", jnp.min(watched, initial=jnp.inf) < bound.arm.link_radius
         yield f"arm {a}: jaws, floor", end < floor - DEPTH
         yield f"arm {a}: shaft, table", jnp.min(shaft[:, 2]) < tool.shaft_radius - DEPTH
+        # contact of two capsules, less the tolerance
         gap = tool.shaft_radius + obstacles.radius - DEPTH
         apart = distance_sq(shaft[:, None], obstacles.start, obstacles.end)
         yield f"arm {a}: shaft, obstacle", apart < gap**2
@@ -108,6 +110,7 @@ def distance_sq(points: jax.Array, start: jax.Array, end: jax.Array) -> jax.Arra
     """Returns squared distances (m^2) of `points` `[..., 3]` from segments; all broadcast."""
     way, off = end - start, points - start
     square = jnp.maximum(jnp.sum(way * way, axis=-1), 1e-12)
+    # nearest point, on the segment
     fraction = jnp.clip(jnp.sum(off * way, axis=-1) / square, 0.0, 1.0)
     return jnp.sum((off - fraction[..., None] * way) ** 2, axis=-1)
 
@@ -145,7 +148,7 @@ def _of_palms(
 
 def _palm(wrist: rcm.Wrist, tip: Pose, shaft: Pose) -> jax.Array:
     """Returns points `[K, 3]` m from the pitch axis to the yaw axis."""
-    end = tip.p - wrist.jaws * tip.R[:, 2]
+    end = tip.p - wrist.jaws * tip.R[:, 2]  # the yaw axis
     return shaft.p + jnp.linspace(0.0, 1.0, PALM_POINTS)[:, None] * (end - shaft.p)
 
 
@@ -158,6 +161,8 @@ def _of_shafts(arms: Sequence[BoundArm], carried: Pose, p_world_trocar: jax.Arra
     fraction = jnp.linspace(0.0, 1.0, 4 * SHAFT_POINTS)[:, None]
     for a, first in enumerate(arms):
         ends = carried.p[a] - first.tool.shaft_end * carried.R[a, :, 2]
+        # Points of one shaft against the other's segment: cheaper than two segments, and as exact
+        # as the points are dense.
         points = p_world_trocar[a] + fraction * (ends - p_world_trocar[a])
         for b, second in list(enumerate(arms))[a + 1 :]:
             end = carried.p[b] - second.tool.shaft_end * carried.R[b, :, 2]
@@ -170,6 +175,6 @@ def _of_links(arms: Sequence[BoundArm], origins: Sequence[jax.Array]) -> Overlap
     """Yields True for joints of two arms closer than the sum of their links' radii."""
     for a, first in enumerate(arms):
         for b, second in list(enumerate(arms))[a + 1 :]:
-            apart = jnp.sum((origins[a][:, None] - origins[b]) ** 2, axis=-1)
+            apart = jnp.sum((origins[a][:, None] - origins[b]) ** 2, axis=-1)  # [J_a, J_b] m^2
             gap = first.arm.link_radius + second.arm.link_radius
             yield f"links of arms {a} and {b}", jnp.min(apart) < gap**2

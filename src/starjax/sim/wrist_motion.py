@@ -44,6 +44,7 @@ def shaft_of(bound: scenes.BoundArm, tip: Pose, angles: jax.Array | None) -> Pos
 
 def limits_at(wrist: rcm.Wrist, depth: jax.Array) -> rcm.Wrist:
     """Returns the wrist with its limits at a depth (m) of its pitch axis."""
+    # In the cannula a wrist cannot bend: its limits open as it leaves.
     share = jnp.clip((depth - rcm.MIN_DEPTH) / OPENING, 0.0, 1.0)
     pitch, yaw = (ENGAGED + share * (limit - ENGAGED) for limit in (wrist.pitch, wrist.yaw))
     return wrist._replace(pitch=pitch, yaw=yaw)
@@ -72,7 +73,7 @@ def toward(
         here, there, fraction, velocity[Reference.POINT], period
     )
     # The rotation is the tip's fraction of its own way on, too, or slower within its limits.
-    way = ik.rotation_between(present.R, target.R)
+    way = ik.rotation_between(present.R, target.R)  # rad about a fixed axis: the shortest turn
     turn = fraction * way
     slower = control.bounded_step(
         way,
@@ -80,7 +81,7 @@ def toward(
         control.MAX_SPIN * period,
         control.MAX_SPIN_ACCELERATION * period**2,
     )
-    is_slower = jnp.sum(slower**2) < jnp.sum(turn**2)
+    is_slower = jnp.sum(slower**2) < jnp.sum(turn**2)  # the rotation may lag behind the tip
     turn = jnp.where(is_slower, slower, turn)
     R = Rotation.from_rotvec(turn).as_matrix() @ present.R
     is_there = jnp.all(step == target.p - present.p) & (fraction == 1.0) & ~is_slower & ~is_slowed
@@ -93,6 +94,7 @@ def carried(wrist: rcm.Wrist, tip: Pose, point: jax.Array) -> tuple[Pose, jax.Ar
 
     Within the limits the tip is kept exactly; see `rcm.through` for others.
     """
+    # m, nearly: of a straight wrist
     depth = jnp.linalg.norm(tip.p - point) - wrist.clevis - wrist.jaws
     found = rcm.through(limits_at(wrist, depth), tip, point)
     return rcm.shaft_of(wrist, found.pose, found.wrist), found.wrist

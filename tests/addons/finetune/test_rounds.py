@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import stubs
 
-from starjax.addons.finetune import dagger, mixing, rounds, self_imitation
+from starjax.addons.finetune import attempts, dagger, mixing, rounds, self_imitation
 from starjax.core.types import Command, Pose
 from starjax.data import load, redraw, store
-from starjax.rollouts import agent, attempts, takeover
+from starjax.rollouts import agent, takeover
 from starjax.rollouts.placement import DeviceLayout
 
 TROCARS = stubs.trocars(0, 8)

@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from starjax.addons.suture import thread
-from starjax.sim import linear
+from starjax.addons.suture import thread, tridiagonal
 
 PERIOD = 1.0 / 30.0
 TAIL = np.array([0.0, 0.0, 0.001], np.float32)
@@ -102,7 +101,7 @@ def test_no_hole_before_the_needle_has_come_out():
     assert not np.asarray(run.place).any() and not np.asarray(run.passed).any()
 
 
-@pytest.mark.parametrize("solve", [linear.in_turn, linear.at_once])
+@pytest.mark.parametrize("solve", [tridiagonal.in_turn, tridiagonal.at_once])
 @pytest.mark.parametrize("count", [1, 2, 31])
 def test_tridiagonal_systems(solve, count):
     rng = np.random.default_rng(count)

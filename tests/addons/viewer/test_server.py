@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from starjax import rcm
-from starjax.addons.viewer import handles, success_map, trocar_controls
+from starjax.addons.viewer import handles, own_pages, success_map, trocar_controls
 from starjax.addons.viewer import page as pages
 from starjax.core import errors
 from starjax.evaluation import result
@@ -185,7 +185,7 @@ def test_a_page_of_another_origin_is_refused(page):
 
 
 def test_unfinished_handshakes_are_dropped(page):
-    most = connections.MAX_PAGES
+    most = own_pages.MAX_PAGES
     with contextlib.ExitStack() as stack:
         half = [
             stack.enter_context(socket.create_connection(("127.0.0.1", page.get_port()), 5))

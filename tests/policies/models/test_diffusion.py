@@ -47,18 +47,6 @@ def test_add_noise_takes_each_samples_own_step():
         np.testing.assert_allclose(together[i], alone, rtol=1e-6)
 
 
-def test_predict_x0_inverts_add_noise():
-    x0, noise = clean((95, 8)), normal(95, 8)
-    k = jnp.arange(95)
-    back = diffusion.predict_x0(SCHEDULE, diffusion.add_noise(SCHEDULE, x0, k, noise), k, noise)
-    np.testing.assert_allclose(back, x0, atol=2e-5)
-
-
-def test_predict_x0_is_clipped():
-    x = jnp.full((1, 2), 3.0)
-    assert float(diffusion.predict_x0(SCHEDULE, x, jnp.array([99]), -x).max()) == 1.0
-
-
 @pytest.mark.parametrize("steps", [1, 2, 10, 100])
 def test_ddim_with_a_perfect_network_returns_the_clean_sequence(steps):
     x0 = clean((2, 16, 4))

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from starjax.addons.finetune import attempts
 from starjax.addons.finetune.rounds import LearnedEpisode, Way
 from starjax.core import config, errors
-from starjax.rollouts import attempts, episodes, progress, takeover
+from starjax.rollouts import episodes, progress, takeover
 from starjax.rollouts.agent import BatchAgent
 
 NAME, SOURCE = "self", "success"

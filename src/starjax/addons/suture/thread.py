@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax.sim import iteration, linear
+from starjax.addons.suture import tridiagonal
+from starjax.sim import iteration
 
 POINTS = 32
 LENGTH = 0.150  # m
@@ -184,6 +185,6 @@ def _spaced(p: jax.Array, free: jax.Array) -> jax.Array:
     side = -free[1:-1] * jnp.sum(n[:-1] * n[1:], -1)
     lower, upper = jnp.pad(side, (1, 0)), jnp.pad(side, (0, 1))
     error = jnp.where(middle > 0.0, length - LINK, 0.0)
-    x = linear.solve_tridiagonal(lower, middle + COMPLIANCE, upper, error)
+    x = tridiagonal.solve(lower, middle + COMPLIANCE, upper, error)
     pull = x[:, None] * n
     return p + free[:, None] * (jnp.pad(pull, ((0, 1), (0, 0))) - jnp.pad(pull, ((1, 0), (0, 0))))

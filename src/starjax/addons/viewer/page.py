@@ -42,17 +42,17 @@ def serve(
       port: of the page.
       label: of the page.
       host: address that it listens at.
-      names: further names under which browsers may open it, see `connections.refusal`.
+      names: further names under which browsers may open it, see `own_pages.refusal`.
 
     Raises:
       errors.UsageError: the port is taken or not permitted.
     """
     import viser
 
-    from starjax.runtime import connections
+    from starjax.addons.viewer import own_pages
 
     # viser prints a banner, and lets pages of other origins connect.
-    with contextlib.redirect_stdout(io.StringIO()), connections.only_own_pages(names, front.adapt):
+    with contextlib.redirect_stdout(io.StringIO()), own_pages.only(names, front.adapt):
         server = viser.ViserServer(host=host, port=port, label=label, verbose=False)
     try:
         # viser silently takes the next free port, which the user would not open.

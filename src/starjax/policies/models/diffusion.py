@@ -51,17 +51,6 @@ def eps_loss(eps_fn: Callable[[jax.Array, jax.Array], jax.Array], batch: Noised)
     return jnp.mean((eps_fn(batch.x, batch.k) - batch.noise) ** 2)
 
 
-def predict_x0(schedule: Schedule, x: jax.Array, k: jax.Array, eps: jax.Array) -> jax.Array:
-    """Computes Eq. 7 solved for the clean sequence, clipped to [-1, 1].
-
-    Without the clip the division by sqrt(alpha_bar), 4.9e-4 at k = 99, would amplify the error.
-    """
-    signal = _at(schedule.sqrt_alpha_bar, k, x.ndim)
-    spread = _at(schedule.sqrt_one_minus_alpha_bar, k, x.ndim)
-    # a_0 = (a_k - sqrt(1 - abar_k) eps) / sqrt(abar_k)
-    return jnp.clip((x - spread * eps) / signal, -1.0, 1.0)
-
-
 def sample_noise(keys: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     """Draws standard normal `[B, *shape]`; row i depends on `keys[i]` alone."""
     # A key a row: a trial's noise is the same in any batch.

@@ -17,15 +17,15 @@ def cast(
     geom_xpos: Array, geom_xmat: Array, geom_rgb: Array,
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Returns depth in m, face (-1 background) and colour (bytes of an int32), each `[T, Q]`."""
-    offset = geom_xpos[scene.ids] - view.p_world_cam
+    offset = geom_xpos[scene.ids] - view.p_world_cam  # m, [N, 3]
     c = jnp.einsum("ij,gj->gi", view.R_cam_world, offset, precision="highest")
     R = jnp.einsum("ij,gjk->gik", view.R_cam_world, geom_xmat[scene.ids], precision="highest")
     t, face = _nearest(scene, grid, c, R)
     shaded = jnp.zeros_like(face, bool)
     if shadow and view.R_light_cam is not None:
         shaded = _shaded(scene, grid, view.R_light_cam, c, R, t, face)
-    depth = jnp.where(face >= 0, t, 1.0)
-    p = [grid.x * depth, grid.y * depth, -depth]
+    depth = jnp.where(face >= 0, t, 1.0)  # the background has none: any finite number
+    p = [grid.x * depth, grid.y * depth, -depth]  # the camera looks along -z
     return t, face, shade.light(scene, view, geom_rgb[scene.ids], c, R, p, face, shaded)
 
 
@@ -39,7 +39,7 @@ def _nearest(
     x, y = jnp.asarray(grid.x), jnp.asarray(grid.y)
 
     def pack(t, face):
-        return (jax.lax.bitcast_convert_type(t, jnp.int32) & ~room) | face
+        return (jax.lax.bitcast_convert_type(t, jnp.int32) & ~room) | face  # [depth bits | face]
 
     visible = tiles.in_view(grid, c, R, *_bounds(scene))
     size = jnp.asarray(scene.size, jnp.float32)
@@ -49,6 +49,7 @@ def _nearest(
 
         def meet(key, row, features, x, y, kind=kind, first=first):
             t, part = rays.view(kind, x, y, features)
+            # the nearest is the smallest integer
             hit = pack(t, first + scenes.FACES[kind] * row + part)
             return jnp.where((row >= 0) & (hit < key), hit, key)
 
@@ -72,13 +73,13 @@ def _shaded(
     x, y = jnp.asarray(grid.x), jnp.asarray(grid.y)
 
     def points(t, x, y):
-        return [t * (i * x + j * y - k) for i, j, k in R_light_cam]
+        return [t * (i * x + j * y - k) for i, j, k in R_light_cam]  # R_light_cam (x, y, -1) t
 
     low, high = [
         jnp.stack([edge(jnp.where(face >= 0, q, far), -1) for q in points(t, x, y)], -1)
         for edge, far in ((jnp.min, rays.FAR), (jnp.max, -rays.FAR))
     ]
-    hides = tiles.over(low, high, c, R, *_bounds(scene))
+    hides = tiles.over(low, high, c, R, *_bounds(scene))  # geoms above a tile's visible points
     size = jnp.asarray(scene.size, jnp.float32)
     shaded = jnp.zeros_like(face, bool)
     for kind in (scenes.CAPSULE, scenes.CYLINDER, scenes.BOX):
@@ -86,7 +87,7 @@ def _shaded(
 
         def hide(shaded, row, features, face, t, x, y, kind=kind, first=first, parts=parts):
             part = face - (first + parts * row)
-            other = (row >= 0) & ((part < 0) | (part >= parts))
+            other = (row >= 0) & ((part < 0) | (part >= parts))  # faces of other geoms alone
             return shaded | (rays.shadow(kind, points(t, x, y), features) & other)
 
         table = rays.features(kind, c[rows], R[rows], size[rows])

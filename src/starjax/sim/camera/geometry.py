@@ -140,7 +140,7 @@ def read(mj_model: mujoco.MjModel, camera: str, aspect: float, moves: bool = Fal
             f"got none of {mj_model.ngeom}"
         )
     kind_of = {g: _KIND_OF[int(mj_model.geom_type[g])] for g in drawn}
-    ids = np.array(sorted(drawn, key=lambda g: (kind_of[g], g)), int)
+    ids = np.array(sorted(drawn, key=lambda g: (kind_of[g], g)), int)  # by kind: each is one loop
     kind = np.array([kind_of[g] for g in ids])
     size, axes, rounding = _sizes(mj_model, ids, kind)
     specular, shininess, emission = _materials(mj_model, ids)
@@ -180,6 +180,7 @@ def geom_rgb(mj_model: mujoco.MjModel) -> np.ndarray:
 def _rgba(mj_model: mujoco.MjModel) -> np.ndarray:
     """Returns MuJoCo's colours: a geom's rgba overrides its material's unless it is the default."""
     rgba = mj_model.geom_rgba.copy()
+    # MuJoCo's grey
     default = np.isclose(rgba, [0.5, 0.5, 0.5, 1.0]).all(1) & (mj_model.geom_matid >= 0)
     rgba[default] = mj_model.mat_rgba[mj_model.geom_matid[default]]
     return rgba
@@ -223,7 +224,7 @@ def _frustum(mj_model, cam: int, aspect: float) -> tuple[float, float, float, fl
             -(height / 2 + cy) / fy,
             (height / 2 - cy) / fy,
         )
-    top = float(np.tan(np.radians(mj_model.cam_fovy[cam]) / 2))
+    top = float(np.tan(np.radians(mj_model.cam_fovy[cam]) / 2))  # half height at depth 1
     return -top * aspect, top * aspect, -top, top
 
 

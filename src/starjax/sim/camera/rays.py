@@ -58,6 +58,7 @@ def normals(kind: int, c: Array, R: Array, size: Array) -> Array:
     u, half = R[:, :, 2], size[:, 1]
     if kind == scenes.CAPSULE:
         return jnp.concatenate([c, u, half[:, None]], -1)
+    # Of opposite faces only the one towards the camera is seen.
     facing = R * jnp.where(jnp.einsum("gij,gi->gj", R, c) < 0, 1.0, -1.0)[:, None]
     flat = -_DISTANT * jnp.swapaxes(facing, 1, 2)  # `[N, 3, 3]`, one row a face
     flat = jnp.pad(flat, ((0, 0), (0, 0), (0, 4)))
@@ -100,8 +101,8 @@ def _view_capsule(x, y, f):
     square, m, away, _, _, _, h, t = _round(x, y, f)
     # Beyond the cylinder's ends the ray meets the ball at the nearer end.
     along = n + t * m
-    end = jnp.where(along > 0, half, -half)
-    b = away - end * m
+    end = jnp.where(along > 0, half, -half)  # centre of the ball at that end
+    b = away - end * m  # the ray against the ball: square t^2 + 2 b t + c = 0
     h_end = b * b - square * (oc2 - 2 * end * n + half * half - r * r)
     t_end = (-b - jnp.sqrt(jnp.maximum(h_end, 0.0))) / square
     t = jnp.where(
@@ -115,8 +116,8 @@ def _view_cylinder(x, y, f):
     _, m, _, a, b, s, h, t = _round(x, y, f)
     on_side = (h > 0) & (jnp.abs(n + t * m) <= half) & (t > NEAR)
     m = jnp.where(jnp.abs(m) < _TINY, _TINY, m)
-    t_disc = (-jnp.sign(m) * half - n) / m
-    across = a * t_disc + b
+    t_disc = (-jnp.sign(m) * half - n) / m  # where the ray meets the plane of the nearer cap
+    across = a * t_disc + b  # a times the ray's own part of the distance from the axis
     on_disc = (across * across + s * s <= a * r * r) & (t_disc > NEAR)
     return jnp.where(on_side, t, jnp.where(on_disc, t_disc, FAR)), jnp.where(on_side, 0, 1)
 
@@ -135,7 +136,7 @@ def _view_box(x, y, f):
     near, far, face = -FAR, FAR, 0
     for k, v in enumerate(_local(x, y, f)):
         inverse = _inverse(v)
-        middle, width = -f[k] * inverse, jnp.abs(inverse) * f[12 + k]
+        middle, width = -f[k] * inverse, jnp.abs(inverse) * f[12 + k]  # the slab's entry and exit
         enter = middle - width
         face = jnp.where(enter > near, k, face)
         near, far = jnp.maximum(near, enter), jnp.minimum(far, middle + width)
@@ -144,7 +145,7 @@ def _view_box(x, y, f):
 
 def _view_plane(x, y, f):
     v = _local(x, y, f)
-    t = -f[2] * _inverse(v[2])
+    t = -f[2] * _inverse(v[2])  # height over the plane / speed towards it
     inside = (jnp.abs(f[0] + t * v[0]) <= f[12]) & (jnp.abs(f[1] + t * v[1]) <= f[13])
     return jnp.where((v[2] < 0) & (t > NEAR) & inside, t, FAR), 0
 
@@ -157,7 +158,7 @@ def _shadow_capsule(p, f):
     # shadow exactly if it lies below.
     along = (dx * ux + dy * uy) / jnp.maximum(ux * ux + uy * uy, _TINY)
     along = jnp.clip(along, -half, half)
-    dx, dy = dx - along * ux, dy - along * uy
+    dx, dy = dx - along * ux, dy - along * uy  # across, seen along the light
     return (dx * dx + dy * dy < r * r) & (cz + along * uz > p[2] + SKIN)
 
 

@@ -70,7 +70,7 @@ def light(
             has_look = view.has_look
             lit = with_look if has_look is None else jnp.where(has_look, with_look, lit)
         lit = jnp.where(face < 0, background[k], lit)
-        word |= (lit * 255 + 0.5).astype(jnp.int32) << (8 * k)
+        word |= (lit * 255 + 0.5).astype(jnp.int32) << (8 * k)  # rounded, one byte a colour
     return word
 
 
@@ -103,8 +103,8 @@ def _reflect(
     diffuse = jnp.maximum(sum(n * v for n, v in zip(normal, to_light)), 0.0)
     if not np.any(source.specular > 0):
         return diffuse, None
-    near = jax.lax.rsqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
-    half = [v - near * x for v, x in zip(to_light, p)]
+    near = jax.lax.rsqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])  # 1 / distance from the camera
+    half = [v - near * x for v, x in zip(to_light, p)]  # to the light + to the eye
     norm = jax.lax.rsqrt(jnp.maximum(sum(h * h for h in half), 1e-12))
     cosine = jnp.clip(sum(n * h for n, h in zip(normal, half)) * norm, 1e-6, 1.0)
     return diffuse, jnp.where(diffuse > 0, jnp.exp2(exponent * jnp.log2(cosine)), 0.0)

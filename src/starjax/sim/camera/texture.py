@@ -16,7 +16,7 @@ def draw(scene: scenes.RenderScene, grid: tiles.Grid) -> dict[int, np.ndarray]:
     """Returns the RGB `[3, T, Q]` of each textured row through every sample, without occlusion."""
     step_x = (scene.right - scene.left) / grid.width
     step_y = (scene.bottom - scene.top) / grid.height
-    shifts = (np.arange(_LOOKUPS) + 0.5) / _LOOKUPS - 0.5
+    shifts = (np.arange(_LOOKUPS) + 0.5) / _LOOKUPS - 0.5  # a grid within the pixel: antialiasing
     return {
         row: np.mean(
             [
@@ -34,7 +34,7 @@ def _look(texture: scenes.Texture, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Returns the texels `[3, ...]` at the rays through (x, y, -1) on the texture's plane."""
     ray = np.stack([x, y, -np.ones_like(x)], -1) @ texture.R_cam_geom
     origin = -texture.p_cam_top @ texture.R_cam_geom
-    t = -origin[2] / np.where(np.abs(ray[..., 2]) < 1e-9, 1e-9, ray[..., 2])
+    t = -origin[2] / np.where(np.abs(ray[..., 2]) < 1e-9, 1e-9, ray[..., 2])  # ray meets z = 0
     h, w, _ = texture.texels.shape
     u, v = [(origin[k] + t * ray[..., k] - texture.corner[k]) * texture.scale[k] for k in range(2)]
     column = np.floor((u - np.floor(u)) * w).astype(int) % w
