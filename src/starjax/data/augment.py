@@ -50,12 +50,14 @@ def augment(
     frames = images.reshape((-1, height, width, 3))
     # One draw for all: each would cost XLA on CPU a second of compilation.
     bits = jax.random.bits(key, (len(frames), 6), jnp.uint32)
+    # places of the crop's corner
     spans = jnp.array([height - crop + 1, width - crop + 1], jnp.uint32)
-    corner = (bits[:, :2] % spans).astype(jnp.int32)
+    corner = (bits[:, :2] % spans).astype(jnp.int32)  # biased by 2^-32 spans: nothing
     if np.ndim(jitter):
         jitter = np.broadcast_to(jitter, lead).reshape(-1, 1)
     if np.ndim(noise):
         noise = np.broadcast_to(noise, lead).reshape(-1, 1, 1, 1)
+    # 24 bits make a float32 in [0, 2): factors are uniform in 1 +- jitter.
     factors = 1.0 + jitter * ((bits[:, 2:5] >> 8).astype(jnp.float32) * 2.0**-23 - 1.0)
     x = jax.vmap(lambda f, c: jax.lax.dynamic_slice(f, (c[0], c[1], 0), (crop, crop, 3)))(
         frames, corner
@@ -86,12 +88,13 @@ def hash_normal(seed: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     Returns:
       float32 `[N, *shape]`.
     """
+    # same for all frames
     counter = hashing.lowbias32(jnp.arange(math.prod(shape), dtype=jnp.uint32))
     bits = hashing.lowbias32(seed[:, None] ^ counter)
-    low, high = bits & 0x00FF00FF, (bits >> 8) & 0x00FF00FF
+    low, high = bits & 0x00FF00FF, (bits >> 8) & 0x00FF00FF  # two bytes each, in 16-bit lanes
     pairs = low + high
     total = (pairs & 0xFFFF) + (pairs >> 16)
-    deviation = ((256.0**2 - 1.0) / 3.0) ** 0.5
+    deviation = ((256.0**2 - 1.0) / 3.0) ** 0.5  # 4 bytes of variance (256^2 - 1) / 12
     return ((total.astype(jnp.float32) - 510.0) / deviation).reshape((-1, *shape))
 
 
@@ -100,9 +103,9 @@ def _jitter(x: jax.Array, brightness: jax.Array, contrast: jax.Array, saturation
     brightness, contrast, saturation = (
         factor[:, None, None, None] for factor in (brightness, contrast, saturation)
     )
-    x = (x * brightness - 0.5) * contrast + 0.5
+    x = (x * brightness - 0.5) * contrast + 0.5  # about mid-grey
     grey = sum(weight * x[..., i : i + 1] for i, weight in enumerate(LUMINANCE))
-    return grey + (x - grey) * saturation
+    return grey + (x - grey) * saturation  # 0: grey, 1: unchanged
 
 
 def _normalize(x: jax.Array, dtype: jnp.dtype) -> jax.Array:

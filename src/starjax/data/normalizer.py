@@ -209,7 +209,7 @@ def entries_but(space: rcm.ActionSpace, arms: int, *names: str) -> np.ndarray:
     """Returns the indices of all parts of the arms' actions except those of these names."""
     parts = [part for name, part in space.slices.items() if name not in names]
     of_one = np.concatenate([np.arange(part.start, part.stop) for part in parts])
-    first = np.arange(arms) * (space.dim + 1)
+    first = np.arange(arms) * (space.dim + 1)  # each arm's part of the vector ends with its jaws
     return (first[:, None] + of_one).ravel()
 
 
@@ -227,6 +227,7 @@ def _min_max(values: np.ndarray, scaled: np.ndarray) -> MinMax:
     constant = high - low < _SMALLEST_RANGE
     middle = 0.5 * (low + high)
     low, high = np.where(constant, middle - 1.0, low), np.where(constant, middle + 1.0, high)
+    # rotations: within [-1, 1], their columns of unit length
     unchanged = np.ones(values.shape[-1], bool)
     unchanged[scaled] = False
     low, high = np.where(unchanged, -1.0, low), np.where(unchanged, 1.0, high)

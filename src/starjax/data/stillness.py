@@ -29,7 +29,7 @@ def is_still(before: Command, after: Command) -> Any:
     Works on numpy and on jax arrays alike.
     """
     np_ = jnp if isinstance(after.pose.p, jax.Array) else np
-    moved = np_.linalg.norm(after.pose.p - before.pose.p, axis=-1)
+    moved = np_.linalg.norm(after.pose.p - before.pose.p, axis=-1)  # m
     # The angle of a small rotation, without the rounding of an arc cosine near 1.
     turned = np_.linalg.norm(after.pose.R - before.pose.R, axis=(-2, -1)) / np.sqrt(2.0)
     closed = np_.abs(after.gripper - before.gripper)
@@ -53,6 +53,7 @@ def before_the_end(still: np.ndarray) -> np.ndarray:
     """Returns the stretches `[T]` without that of the end, a final hold."""
     lengths = stretches(still)
     moving = np.flatnonzero(~still)
+    # At the end a demonstration may rest: nothing follows that a policy could miss.
     lengths[moving[-1] + 1 if len(moving) else 0 :] = 0
     return lengths
 

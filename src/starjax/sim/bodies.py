@@ -14,7 +14,7 @@ from starjax.sim.task import Contacts
 def free_pose(qpos: jax.Array, start: int) -> Pose:
     """Returns the world pose of the free body with 7 coordinates from `start` of `qpos` `[Q]`."""
     coords = qpos[start : start + 7]
-    w, x, y, z = coords[3:] / jnp.linalg.norm(coords[3:])
+    w, x, y, z = coords[3:] / jnp.linalg.norm(coords[3:])  # integration lets the length drift
     rows = (
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
@@ -25,6 +25,7 @@ def free_pose(qpos: jax.Array, start: int) -> Pose:
 
 def upright_coords(pose: Pose) -> jax.Array:
     """Returns the 7 coordinates of a free body that is turned about the world's z axis only."""
+    # half the yaw: quaternion (cos, 0, 0, sin)
     half, zero = 0.5 * jnp.arctan2(pose.R[1, 0], pose.R[0, 0]), jnp.zeros(())
     return jnp.concatenate([pose.p, jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)])])
 
@@ -46,5 +47,6 @@ def is_sound(
 
 def touch(contacts: Contacts, *groups: np.ndarray) -> jax.Array:
     """Returns True if one contact overlaps geoms of every group of ids."""
+    # [C] each
     hits = [jnp.any(contacts.geom[..., None] == jnp.asarray(ids), axis=(-2, -1)) for ids in groups]
     return jnp.any(functools.reduce(jnp.logical_and, hits, contacts.dist < 0))

@@ -117,6 +117,7 @@ def images(
             frames[camera.name] = _as_image(camera, draw(*inputs))
             continue
         R_world_body, p_world_body = data.xmat[camera.body], data.xpos[camera.body]
+        # T_world_body T_body_camera
         pose = Pose(R_world_body @ poses.R[i], p_world_body + R_world_body @ poses.p[i])
         frames[camera.name] = _as_image(camera, draw(*inputs, pose, has_look))
     return frames

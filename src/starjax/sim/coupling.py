@@ -64,7 +64,7 @@ def _moving(bound: scenes.BoundArm, qpos: jax.Array, p_trocar: jax.Array) -> tup
     chain = scenes.chain_at(bound, p_trocar)
     arm = ik.jacobian(chain, qpos[bound.q][: bound.joints], 1.0)
     moves, turns = arm[:3], arm[3:]
-    moves = moves + jnp.cross(turns.T, tip.p - carried.p).T
+    moves = moves + jnp.cross(turns.T, tip.p - carried.p).T  # v_tip = v + w x (p_tip - p)
     if bound.tool.wrist is not None:
         # Pitch turns about y of the shaft's frame, yaw about x of the tip's; see `rcm.wrist`.
         axes = jnp.stack([carried.R[:, 1], tip.R[:, 0]])

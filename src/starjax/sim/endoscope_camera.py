@@ -110,7 +110,7 @@ def looking_at(
     length = jnp.linalg.norm(target - p_trocar)
     straight = (target - p_trocar) / length
     up = jnp.array(up)
-    up = up - (up @ straight) * straight
+    up = up - (up @ straight) * straight  # level: the picture's up is across the line of sight
     up = up / jnp.maximum(jnp.linalg.norm(up), 1e-6)
     # Triangle of trocar, lens and target: `lean` is its angle at the lens, e the one at the trocar,
     # and by the law of sines sin e = distance sin(lean) / length.
@@ -119,6 +119,6 @@ def looking_at(
     cosine_e = jnp.sqrt(1.0 - sine_e**2)
     axis = cosine_e * straight + sine_e * up
     p = p_trocar + (length * cosine_e - distance * cosine) * axis
-    back = (p - target) / distance
+    back = (p - target) / distance  # the camera's z axis
     right = jnp.cross(straight, up)
     return Pose(jnp.stack([right, jnp.cross(back, right), back], axis=-1), p)

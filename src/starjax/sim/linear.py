@@ -18,7 +18,7 @@ def solve_positive(H: jax.Array, g: jax.Array) -> jax.Array:
 
     Gauss-Jordan elimination without pivoting, stable for such an H. Not finite for a singular H.
     """
-    rows = jnp.concatenate([H, g[:, None]], axis=1)
+    rows = jnp.concatenate([H, g[:, None]], axis=1)  # [H | g] becomes [I | x]
     index = np.arange(len(g))[:, None]
     if len(g) >= LOOP_FROM:
 
@@ -30,5 +30,6 @@ def solve_positive(H: jax.Array, g: jax.Array) -> jax.Array:
         return jax.lax.fori_loop(0, len(g), eliminate, rows)[:, -1]
     for i in range(len(g)):
         pivot = rows[i] / rows[i, i]
+        # all other rows at once
         rows = jnp.where(index == i, pivot, rows - rows[:, i : i + 1] * pivot)
     return rows[:, -1]

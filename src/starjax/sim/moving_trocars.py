@@ -24,6 +24,7 @@ def move_trocars(env: Env, state: EnvState, p_world_trocar: jax.Array) -> EnvSta
     Args:
       p_world_trocar: `[A, 3]` m.
     """
+    # Selected, not recomputed: a trocar that stays must keep its last bits.
     is_moved = jnp.any(p_world_trocar != state.trocar.p_world_trocar)
     moved = frame_at(env, p_world_trocar)
     trocar, measured_trocar = (
@@ -71,7 +72,7 @@ def carried(task: Task, command: Command, p_before: jax.Array, p_now: jax.Array)
       command: `[..., A]`.
       p_before, p_now: `[..., A, 3]` m, trocars at the time of the plan and now.
     """
-    held = rcm.rcm_error(wrists.shafts(task, command), p_before) < HELD
+    held = rcm.rcm_error(wrists.shafts(task, command), p_before) < HELD  # a plan on the manifold
     is_other = held & jnp.any(p_before != p_now, axis=-1)
     turned = command._replace(pose=rcm.project(command.pose, p_now))
     if command.wrist is not None:

@@ -15,6 +15,7 @@ def sample_trocars(key: jax.Array, task: Task, shape: tuple[int, ...] = ()) -> r
         work = registries.workspaces.get(slot.workspace)
         arms.append(
             rcm.sample_trocar(
+                # The first arm's draws are those of a task with one arm.
                 jax.random.fold_in(key, a) if a else key,
                 shape,
                 radius_range=work.radius,

@@ -72,8 +72,10 @@ class ImageEncoder(nn.Module):
         kernel = self.param(
             "keypoints", layers.uniform_init(maps.shape[-1]), (maps.shape[-1], self.features // 2)
         )
+        # [N, h, w, K]
         logits = jnp.matmul(maps, kernel.astype(maps.dtype), preferred_element_type=jnp.float32)
         points = spatial_softmax.spatial_softmax(logits, (image.shape[1], image.shape[2]), offset)
+        # v_t (Eq. 10)
         return layers.Dense(self.features, name="out")(points.reshape(len(points), -1))
 
 
@@ -94,6 +96,7 @@ class SmallTrunk(nn.Module):
         x = image.astype(self.dtype)
         for doubling, stride in ((0, 2), (0, 1), (1, 2), (1, 1), (2, 2), (2, 1), (2, 1)):
             x = resnet.Conv2d(self.width << doubling, 3, stride)(x)
+            # GroupNorm: statistics of a batch would differ between training and a single robot.
             x = nn.relu(GroupNorm(x.shape[-1] // 8)(x))
         return x
 
@@ -114,7 +117,7 @@ class StateEncoder(nn.Module):
         x = layers.mish(layers.Conv1d(self.features // 4, 3)(x))
         x = layers.mish(layers.Conv1d(self.features // 2, 3)(x))
         x = layers.Conv1d(self.features, x.shape[1], padding=0)(x)
-        return x[:, 0].astype(jnp.float32)
+        return x[:, 0].astype(jnp.float32)  # s (Eq. 11): one position is left
 
 
 RESNET18 = Trunk(resnet.ResNet18, 64, 32)

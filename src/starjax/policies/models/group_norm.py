@@ -52,7 +52,7 @@ def moments(x: jax.Array, entries: int | None = None) -> tuple[jax.Array, jax.Ar
     wide = x.astype(jnp.float32)
     entries = math.prod(x.shape[1:-1]) if entries is None else entries
     positions = tuple(range(1, x.ndim - 1))
-    return wide.sum(positions) / entries, (wide * wide).sum(positions) / entries
+    return wide.sum(positions) / entries, (wide * wide).sum(positions) / entries  # E[x], E[x^2]
 
 
 def affine(
@@ -61,10 +61,11 @@ def affine(
     """Returns the gain and offset `[B, C]` that normalise samples of these `moments`."""
     shape = mean.shape
     mean, square = (m.reshape(len(m), groups, -1).mean(-1) for m in (mean, square))
+    # 1 / sqrt(E[x^2] - E[x]^2)
     inverse = jax.lax.rsqrt(jnp.maximum(square - mean * mean, 0.0) + EPSILON)
     mean, inverse = (jnp.repeat(m, shape[1] // groups, axis=1) for m in (mean, inverse))
     gain = inverse * layers.spread(scale, shape)
-    return gain, layers.spread(shift, shape) - mean * gain
+    return gain, layers.spread(shift, shape) - mean * gain  # y = gain x + (shift - gain mean)
 
 
 def normalized(x: jax.Array, gain: jax.Array, offset: jax.Array) -> jax.Array:

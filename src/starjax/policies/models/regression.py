@@ -53,7 +53,7 @@ class MixtureNet(nn.Module):
         outputs = layers.Dense(self.components + size, name="out")(x).astype(jnp.float32)
         logits, means = jnp.split(outputs, [self.components], axis=-1)
         shape = (-1, self.components, self.horizon, self.action_dim)
-        return Mixture(logits, means.reshape(shape))
+        return Mixture(logits, means.reshape(shape))  # [B, M], [B, M, H, D]
 
 
 def loss(mixture: Mixture, x0: jax.Array, spread: float) -> jax.Array:
@@ -78,5 +78,6 @@ def loss(mixture: Mixture, x0: jax.Array, spread: float) -> jax.Array:
 
 def draw(mixture: Mixture, keys: jax.Array) -> jax.Array:
     """Returns the mean `[B, H, D]` of a component that is drawn with each of the keys `[B]`."""
+    # One component for the whole sequence: modes are not mixed within it.
     chosen = jax.vmap(jax.random.categorical)(keys, mixture.logits)
     return jnp.take_along_axis(mixture.means, chosen[:, None, None, None], axis=1)[:, 0]

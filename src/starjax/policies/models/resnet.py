@@ -58,6 +58,7 @@ class Stem(nn.Module):
         down, right = math.ceil(height / 4), math.ceil(width / 8)
         pads = ((0, 0), (4, 4 * down + 2 - height), (4, 8 * right + 4 - width), (0, 0))
         y = _convolve(_blocks(jnp.pad(x, pads)), _to_blocks(kernel.astype(x.dtype)), 1, 0)
+        # a block's outputs side by side
         y = y.reshape(len(x), down, 2, 2 * right, 2, self.features)
         return y[:, :, :, : math.ceil(width / 4)]
 
@@ -97,7 +98,7 @@ class BasicBlock(nn.Module):
         y = Conv2d(self.features, 3, self.stride, name="conv1")(x)
         y = nn.relu(group_norm("bn1", y))
         y = group_norm("bn2", Conv2d(self.features, 3, name="conv2")(y))
-        if x.shape != y.shape:
+        if x.shape != y.shape:  # where stride or width change: 1x1
             x = Conv2d(self.features, 1, self.stride, name="downsample_0")(x)
             x = group_norm("downsample_1", x)
         return _relu_of_sum(x, y)

@@ -29,12 +29,13 @@ def spatial_softmax(
     weights = weights.reshape(n, height, width, maps)
     # Two small sums instead of one product with a [h w, 2] table: nothing here may be rounded to
     # a matrix unit's low precision, 1 mm of board is about 0.01 in these units.
-    row = (weights.sum(2) * _centres(height)[None, :, None]).sum(1)
+    row = (weights.sum(2) * _centres(height)[None, :, None]).sum(1)  # E[row] = sum_i p(i) centre_i
     column = (weights.sum(1) * _centres(width)[None, :, None]).sum(1)
     points = jnp.stack([row, column], -1)
     if offset is None:
         return points
     half = jnp.array([image_size], jnp.float32) / 2
+    # Back to the uncropped image: a random crop must not move what the policy points at.
     return points + (offset.astype(jnp.float32) / half)[:, None, :]
 
 
