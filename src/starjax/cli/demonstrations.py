@@ -250,10 +250,10 @@ def complete(
 
 def with_features(
     config: config_lib.RunConfig,
-    env: Env,
+    env: Env | None,
     root: Path,
     loaded: loading.Demos,
-    encoder: Encoder | None,
+    encoder: Encoder,
 ) -> Any:
     """Returns frames that were loaded without images, with the features of a frozen encoder."""
     dataset = loaded.dataset
@@ -282,7 +282,7 @@ def with_features(
     return dataset.replace(observation=dataset.observation._replace(features=features))
 
 
-def frozen_encoder(policy: config_lib.PolicyConfig) -> Any:
+def frozen_encoder(policy: config_lib.PolicyConfig) -> Encoder | None:
     """Returns the frozen image encoder, None for other policies.
 
     Raises:

@@ -1,5 +1,6 @@
 """Compiles the programs of a run during its first stages, which keep the processor's cores free."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -54,12 +55,12 @@ def begin(
     policy = Precompiled().policy
     demos, rows = demonstrations.size(config, env.task)
 
-    def see() -> None:
+    def see(encoder: Encoder) -> None:
         for frames in redraw.precompile(env, demos).values():
             frozen.precompile(encoder, config.policy, frames)
 
     if encoder and demos:
-        precompile.start(see)
+        precompile.start(functools.partial(see, encoder))
     shapes = env.task, env.names.cameras, demos, rows
     step = precompile.start(
         lambda: training.step_program(row, config.policy, config.train, *shapes)

@@ -79,8 +79,10 @@ def load(
     if sources:
         redraw.expect_possible("sources", description)
     is_drawn = images and _is_drawn(description, env)
-    found = redraw.sources(root, description, records, env) if sources or is_drawn else None
-    drawn = redraw.images_of(found, records, env) if found and is_drawn else {}
+    found = (
+        redraw.sources(root, description, records, env) if env and (sources or is_drawn) else None
+    )
+    drawn = redraw.images_of(found, records, env) if env and found and is_drawn else {}
     fields = _fields(description, records[0], images and not drawn)
     total = sum(r["files"][file]["bytes"] for r in records for file in fields.values())
     total += sum(math.prod(array.shape) for array in drawn.values())  # uint8: a byte each
@@ -130,7 +132,7 @@ def frames(root: Path, env: Env | None = None) -> "Mapping[str, EpisodeArray | r
     root = Path(root)
     description = store.read_description(root)
     records = _successful(root, store.read_seal(root), verify=False)
-    if _is_drawn(description, env):
+    if env and _is_drawn(description, env):
         return redraw.images(root, description, records, env)
     fields = _fields(description, records[0], images=True)
     length, start = _spans(records)
@@ -179,7 +181,7 @@ def _fields(description: dict[str, Any], record: store.Record, images: bool) -> 
     return {name: file for name, file in found.items() if file in record["files"]}
 
 
-def _is_drawn(description: dict[str, Any], env: Env) -> bool:
+def _is_drawn(description: dict[str, Any], env: Env | None) -> bool:
     """Returns True if an environment draws the images: they were not recorded at its size."""
     return (
         env is not None
