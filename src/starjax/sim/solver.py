@@ -216,8 +216,7 @@ def line_search(slope: Callable[[jax.Array], jax.Array], first: jax.Array) -> ja
         )
     rise = slopes[1] - slopes[0]
     is_enclosed = jnp.isfinite(rise) & (rise > 0)
-    # Secant, exact where no contact changes its zone: the slope is piecewise linear up to the
-    # cones' curvature.
+    # Secant, exact but for the cones' curvature where no contact changes its zone.
     fraction = jnp.where(is_enclosed, -slopes[0] / jnp.where(is_enclosed, rise, 1.0), 1.0)
     return low + (high - low) * jnp.clip(fraction, 0.0, 1.0)
 

@@ -12,6 +12,7 @@ from starjax.addons.viewer import (
     devices,
     recorder,
     relief,
+    selection,
     shared_control,
     simulation,
     teleop,
@@ -63,7 +64,7 @@ def hurried(monkeypatch):
 
 def test_trials_follow_one_another(page, expert, hurried, monkeypatch):
     monkeypatch.setattr(simulation, "load", lambda who, arms=(): expert)
-    asked = view.ViewOptions((simulation.expert("reach"),), trocar=2, seed=SEED)
+    asked = selection.ViewOptions((simulation.expert("reach"),), trocar=2, seed=SEED)
     said = view.run(page, asked, after(320, {300: lambda: press(page, "Next")}))
     won, ended = (int(word) for word in said.split(":")[1].split("trials")[0].split("of"))
     assert won == ended >= 2
@@ -75,7 +76,7 @@ def test_a_pause_holds_and_a_step_is_one(page, expert, hurried, monkeypatch):
     step = expert.step
     counted = expert._replace(step=lambda *given: (taken.append(1), step(*given))[1])
     monkeypatch.setattr(simulation, "load", lambda who, arms=(): counted)
-    asked = view.ViewOptions((simulation.expert("reach"),), seed=SEED)
+    asked = selection.ViewOptions((simulation.expert("reach"),), seed=SEED)
     presses = {0: lambda: press(page, "Play or pause"), 3: lambda: press(page, "Step")}
     view.run(page, asked, after(8, presses))
     assert len(taken) == 2  # the first one compiles, and is dropped
@@ -91,7 +92,7 @@ def test_the_page_says_that_it_compiles_and_that_it_pauses(page, expert, hurried
         return step(*given)
 
     monkeypatch.setattr(simulation, "load", lambda who, arms=(): expert._replace(step=recorded))
-    asked = view.ViewOptions((simulation.expert("reach"),), seed=SEED)
+    asked = selection.ViewOptions((simulation.expert("reach"),), seed=SEED)
     view.run(page, asked, after(6, {2: lambda: press(page, "Play or pause")}))
     assert at_first_step[0].startswith("Compiling") and "Compiling" not in at_first_step[-1]
     assert ", paused:" in shown[-1]
@@ -140,7 +141,7 @@ def test_an_own_trocar_is_shown_as_such_and_counted_apart(page, expert, hurried,
     def choose():
         widget(page, "Trocar").value = "3 (seen)"
 
-    asked = view.ViewOptions((simulation.expert("reach"),), trocar=2, seed=SEED)
+    asked = selection.ViewOptions((simulation.expert("reach"),), trocar=2, seed=SEED)
     acts = {1: look, 160: drag, 163: look, 480: look, 490: choose, 495: look}
     said = view.run(page, asked, after(500, acts))
     assert [own for _, own in shown] == [False, True, True, False]

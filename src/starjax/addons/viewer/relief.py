@@ -8,9 +8,10 @@ import numpy as np
 from starjax.addons.viewer import page, shared_control
 from starjax.addons.viewer.frame import Frame
 from starjax.addons.viewer.recorder import Recorder, Steering
+from starjax.addons.viewer.selection import trocar_names
 from starjax.addons.viewer.shared_control import SharedControl
 from starjax.addons.viewer.simulation import LiveState, Simulation
-from starjax.addons.viewer.view import Rollouts, trocar_names
+from starjax.addons.viewer.view import Rollouts
 
 
 class FixedTrocars:

@@ -12,10 +12,11 @@ from starjax.addons.viewer import goal_distance, page, shared_control
 from starjax.addons.viewer.devices import Device
 from starjax.addons.viewer.frame import outcome, rcm_error_mm
 from starjax.addons.viewer.recorder import Recorder, Steering
+from starjax.addons.viewer.selection import trocar_names
 from starjax.addons.viewer.shared_control import SharedControl
 from starjax.addons.viewer.stage import Stage, aim
 from starjax.addons.viewer.teleop_target import Pilot
-from starjax.addons.viewer.view import REST_S, trocar_names
+from starjax.addons.viewer.view import REST_S
 from starjax.rollouts import episodes
 
 _PICTURE_WIDTH = 480  # pixels

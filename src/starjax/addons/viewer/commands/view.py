@@ -163,7 +163,7 @@ def _trials(file: str) -> Show:
 
 def _live(args: ViewArgs) -> Show:
     """Makes the live view of one agent or two."""
-    from starjax.addons.viewer import simulation, view
+    from starjax.addons.viewer import selection, simulation, view
 
     agents = [_agent(args.policy, args.run, args.task)]
     if args.compare_with:
@@ -174,9 +174,9 @@ def _live(args: ViewArgs) -> Show:
             "--compare-with", f"one that does {agents[0].task}", agents[-1].task
         )
     _expect_scene(args, agents[0].task)
-    initial = view.ViewOptions(
+    initial = selection.ViewOptions(
         tuple(agents),
-        args.arm or view.OWN_ARMS,
+        args.arm or selection.OWN_ARMS,
         args.trocar,
         args.seed,
         _sweep(args, agents[0].task),
