@@ -152,7 +152,7 @@ def through(wrist: Wrist, pose_world_tip: Pose, p_world_trocar: ArrayLike) -> Wr
     deep = _angles(wrist, R, jnp.maximum(length, least)[..., None] * line)
     angles = limited(wrist, jnp.where(is_feasible[..., None], angles, deep))
     bend = bent(wrist, angles)
-    depth, _ = tip_depth(bend, length)  # of the tip, along the shaft
+    depth, _ = tip_depth(bend, length)  # the tip's, along the shaft
     # 1. Any shaft whose tip lies on the line: the least turn of the target's.
     R_shaft = arrays.matmul(R, bend.R.mT)
     toward_tip = arrays.matvec(R_shaft, tip_direction(bend, depth))
@@ -224,7 +224,7 @@ def _is_feasible(wrist: Wrist, angles: jax.Array, length: jax.Array) -> tuple[ja
 
 def shaft_at(R: jax.Array, depth: jax.Array, bend: Pose, p_world_trocar: jax.Array) -> Pose:
     """Returns the shaft through the trocar with a tip at a depth along it."""
-    insertion = depth - bend.p[..., 2]  # of W, the pitch axis
+    insertion = depth - bend.p[..., 2]  # depth of W, the pitch axis
     return Pose(R, p_world_trocar + insertion[..., None] * R[..., :, 2])
 
 

@@ -1,13 +1,16 @@
 """Fig. 4 (success against distance from the training trocars, map of the disc) and loss curves."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starjax.evaluation import rate_map
 from starjax.evaluation.result import Trial
 from starjax.report import captions, compare, outcomes, results, stats, style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _BIN = 0.005  # m of distance pooled in one point
 _DISC = 0.05  # m, radius of Eq. 19's disc
@@ -106,7 +109,7 @@ def _pooled(run: results.Run) -> list[tuple[float, stats.Rate]]:
     return [(1e3 * apart[i].mean(), outcomes.tally(trials[j] for j in i)) for i in inside]
 
 
-def _dots(axis: Any, run: results.Run, shades: dict[str, str]) -> None:
+def _dots(axis: "Axes", run: results.Run, shades: dict[str, str]) -> None:
     """Draws one method: pooled rates as dots with intervals and counts, single trocars faintly."""
     points, color = _pooled(run), style.SUCCESS
     x, scores = [at for at, _ in points], [score for _, score in points]
@@ -125,14 +128,14 @@ def _dots(axis: Any, run: results.Run, shades: dict[str, str]) -> None:
         )
 
 
-def _whiskers(axis: Any, run: results.Run, offset: float, stroke: str) -> None:
+def _whiskers(axis: "Axes", run: results.Run, offset: float, stroke: str) -> None:
     """Draws one of several methods: a line with whiskers, shifted by `offset` mm."""
     points = _pooled(run)
     x, scores = [at + offset for at, _ in points], [score for _, score in points]
     style.rates(axis, x, scores, run.result.method, run.label, stroke)
 
 
-def _disc(figure: Any, axis: Any, run: results.Run, shades: dict[str, str]) -> None:
+def _disc(figure: Any, axis: "Axes", run: results.Run, shades: dict[str, str]) -> None:
     """Draws trocars from above: a smoothed map of a sweep, else a dot per trocar."""
     groups = outcomes.by_trocar(run.sweep.trials if run.sweep else run.trials)
     arms = len(groups[0][0].radius)
@@ -171,7 +174,7 @@ def _from_above(trials: Sequence[Trial]) -> np.ndarray:
     return 1e3 * outcomes.positions(trials)[..., :2].reshape(-1, 2)
 
 
-def _heat(axis: Any, at: np.ndarray, rates: np.ndarray, weights: np.ndarray) -> Any:
+def _heat(axis: "Axes", at: np.ndarray, rates: np.ndarray, weights: np.ndarray) -> Any:
     """Draws the kernel mean of `rates [N]` at `at [N, 2]` mm, weighted by trials."""
     line = np.linspace(-_DISC, _DISC, 161)
     mean = rate_map.around(line, line, 1e-3 * at, rates, weights)

@@ -1,12 +1,15 @@
 """Table and figure of a stress.json: success and RCM error under each disturbance."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starjax.evaluation.disturbances import current_name
 from starjax.report import formats, stats, style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 NOTE = (
     "Each row is one disturbance alone, on the trials of the undisturbed policy. Success with its "
@@ -145,6 +148,6 @@ def _logarithm(score: Content) -> float:
     return float(np.clip(np.log10(max(error or 0.0, _MIN_MM) / _MIN_MM), 0.0, 3.0))
 
 
-def _around(axis: Any, angles: np.ndarray, values: list[float], line: dict[str, Any]) -> None:
+def _around(axis: "Axes", angles: np.ndarray, values: list[float], line: dict[str, Any]) -> None:
     closed = [*range(len(angles)), 0]
     axis.plot(angles[closed], np.array(values)[closed], **line)

@@ -11,10 +11,13 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from starjax.core import methods
 from starjax.report import stats
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 SUCCESS, FAILURE = "#2083C5", "#D55E00"
 # In the order of the methods' table: a method keeps its colour in every figure.
@@ -106,7 +109,7 @@ def strokes(names: Sequence[str]) -> list[str]:
 
 
 def rates(
-    axis: Any,
+    axis: "Axes",
     x: Sequence[float],
     scores: Sequence[stats.Rate],
     name: str,
@@ -154,7 +157,7 @@ def save(figure: Any, kind: str, dark: bool = False) -> bytes:
     return stream.getvalue()
 
 
-def percent_axis(axis: Any) -> None:
+def percent_axis(axis: "Axes") -> None:
     """Makes a y axis of fractions read 0-100%."""
     axis.set_ylim(-0.03, 1.03)
     axis.set_yticks([0, 0.25, 0.5, 0.75, 1], ["0", "25", "50", "75", "100%"])

@@ -5,7 +5,7 @@ The scene is flat shapes in a fixed view: 2-D artists in painter's order draw it
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,9 @@ from starjax.report import compare, outcomes, results, style
 from starjax.report.scene_view import SceneView
 from starjax.sim.names import SceneNames
 from starjax.sim.task import Outline
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Stages = Callable[[SceneNames], SceneView]
 
@@ -80,7 +83,7 @@ def _panels(runs: Sequence[results.Run], seen: bool) -> list[int]:
 
 
 def _panel(
-    axis: Any,
+    axis: "Axes",
     runs: Sequence[results.Run],
     index: int,
     stages: Stages,
@@ -110,7 +113,7 @@ def _panel(
         axis.plot(*_flat(trocar), "x", **cross)
 
 
-def _areas(axis: Any, outline: Outline, shades: dict[str, str]) -> None:
+def _areas(axis: "Axes", outline: Outline, shades: dict[str, str]) -> None:
     axis.set_axis_off()
     axis.set_aspect("equal")
     colours = {"facecolor": shades["line"], "edgecolor": shades["muted"]}
@@ -122,7 +125,7 @@ def _areas(axis: Any, outline: Outline, shades: dict[str, str]) -> None:
 
 
 def _path(
-    axis: Any,
+    axis: "Axes",
     tip: np.ndarray,
     won: bool,
     color: str,
@@ -139,7 +142,7 @@ def _path(
     axis.plot(*flat[-1], "o" if won else "s", color=color, markersize=5, zorder=7)
 
 
-def _shafts(axis: Any, rollout: results.TrialTrajectory, color: str, scene: SceneView) -> None:
+def _shafts(axis: "Axes", rollout: results.TrialTrajectory, color: str, scene: SceneView) -> None:
     """Draws the shafts along a rollout, from the tips to beyond the trocars.
 
     A wrist is drawn as a line from the shaft's end to the tip.
@@ -174,7 +177,9 @@ def _frame(outline: Outline, runs: Sequence[results.Run]) -> tuple[tuple[float, 
     return tuple((float(a), float(b)) for a, b in zip(low, high))
 
 
-def _scale_bar(axis: Any, frame: tuple[tuple[float, float], ...], shades: dict[str, str]) -> None:
+def _scale_bar(
+    axis: "Axes", frame: tuple[tuple[float, float], ...], shades: dict[str, str]
+) -> None:
     x, y = frame[0][0], frame[1][0] + 0.002
     axis.plot([x, x + 0.02], [y, y], color=shades["muted"], linewidth=1.6, solid_capstyle="butt")
     axis.text(x + 0.01, y + 0.002, "20 mm", ha="center", fontsize=7, color=shades["muted"])

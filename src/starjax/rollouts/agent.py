@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from starjax.core import errors
 from starjax.core.types import Agent, Command, Observation
 from starjax.rollouts import placement
+from starjax.sim.state import EnvState
 
 Observe = Callable[[], Observation]
 
@@ -39,10 +40,10 @@ class BatchAgent(NamedTuple):
 def from_single(agent: Agent) -> BatchAgent:
     """Makes a batch of one that acts in a single episode, e.g. an expert; `params` are not used."""
 
-    def init(params: Any, keys: jax.Array, state: Any, observe: Observe) -> Any:
+    def init(params: Any, keys: jax.Array, state: EnvState, observe: Observe) -> Any:
         return jax.vmap(agent.init)(keys, state)
 
-    def act(params: Any, memory: Any, state: Any, observe: Observe, t: jax.Array) -> Any:
+    def act(params: Any, memory: Any, state: EnvState, observe: Observe, t: jax.Array) -> Any:
         return jax.vmap(agent.act)(memory, state)
 
     return BatchAgent(init, act, {})
@@ -52,7 +53,7 @@ def replay(command: Command) -> Agent:
     """Makes an agent that executes recorded commands `[T, A]`, and holds the last one."""
     last = len(command.gripper) - 1
 
-    def act(memory: tuple[()], state: Any) -> tuple[Command, tuple[()], Command]:
+    def act(memory: tuple[()], state: EnvState) -> tuple[Command, tuple[()], Command]:
         t = jnp.minimum(state.step, last)
         now = jax.tree.map(lambda x: jnp.asarray(x)[t], command)
         return now, memory, now
@@ -94,7 +95,7 @@ def from_policy(sample: Callable[..., Command], obs_horizon: int, execute: int) 
     # Traced once for the programs that start and that advance.
     sample = jax.jit(sample, inline=True)
 
-    def init(params: Any, keys: jax.Array, state: Any, observe: Observe) -> Plan:
+    def init(params: Any, keys: jax.Array, state: EnvState, observe: Observe) -> Plan:
         def first() -> tuple[Observation, Command]:
             seen = _repeated(observe(), obs_horizon)
             return seen, sample(*params, keys, seen, state.measured_trocar)
@@ -106,7 +107,7 @@ def from_policy(sample: Callable[..., Command], obs_horizon: int, execute: int) 
         return Plan(keys, *jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), (seen, command)))
 
     def act(
-        params: Any, memory: Plan, state: Any, observe: Observe, t: jax.Array
+        params: Any, memory: Plan, state: EnvState, observe: Observe, t: jax.Array
     ) -> tuple[Command, Plan, Command]:
         def look(seen: Observation) -> Observation:
             now = observe()

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from starjax import rcm
 from starjax.core.types import Command, Pose
 from starjax.rollouts import agent
+from starjax.sim.state import EnvState
 
 DECAY = 0.01  # a control step, as in ACT
 
@@ -48,12 +49,12 @@ def from_policy(
     """
     planner = agent.from_policy(sample, obs_horizon, 1)
 
-    def init(params: Any, keys: jax.Array, state: Any, observe: agent.Observe) -> Memory:
+    def init(params: Any, keys: jax.Array, state: EnvState, observe: agent.Observe) -> Memory:
         memory = planner.init(params, keys, state, observe)
         return Memory(memory, jax.tree.map(jnp.zeros_like, memory.command))
 
     def act(
-        params: Any, memory: Memory, state: Any, observe: agent.Observe, t: jax.Array
+        params: Any, memory: Memory, state: EnvState, observe: agent.Observe, t: jax.Array
     ) -> tuple[Command, Memory, Command]:
         _, planned, _ = planner.act(params, memory.planner, state, observe, t)
         weight, whole = weights(planned.command.gripper.shape[1], t)

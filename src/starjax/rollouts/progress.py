@@ -1,9 +1,11 @@
 """Signals of an episode in trouble, from the simulator's state."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+
+from starjax.sim.state import EnvState
 
 GAIN = 0.02  # part of the reward, the least that counts as progress
 
@@ -27,7 +29,7 @@ def begin() -> BestReward:
     return BestReward(jnp.zeros(()), jnp.zeros((), jnp.int32))
 
 
-def update(memory: BestReward, state: Any, stalled_steps: int) -> tuple[BestReward, jax.Array]:
+def update(memory: BestReward, state: EnvState, stalled_steps: int) -> tuple[BestReward, jax.Array]:
     """Returns the progress with this moment, and True if the episode has stalled.
 
     Args:

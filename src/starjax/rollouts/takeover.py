@@ -15,6 +15,7 @@ from starjax.rollouts import episodes, placement, progress
 from starjax.rollouts.agent import BatchAgent, Observe
 from starjax.sim import wrists
 from starjax.sim.rescuer import Rescuer
+from starjax.sim.state import EnvState
 
 POLICY, EXPERT, PERSON = range(3)  # values of the field `actor`, see `episodes.FIELDS`
 ACTOR, CAUSE = "actor", "cause"  # recorded fields, `[N]` uint8
@@ -64,7 +65,7 @@ def from_policy(policy: BatchAgent, rescuer: Rescuer) -> BatchAgent:
 def _functions(
     begin: Callable[..., Any], decide: Callable[..., Any], rescuer: Rescuer
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:
-    def init(params: Any, keys: jax.Array, state: Any, observe: Observe) -> Takeover:
+    def init(params: Any, keys: jax.Array, state: EnvState, observe: Observe) -> Takeover:
         key_policy, key = jnp.moveaxis(jax.vmap(jax.random.split)(keys), 1, 0)
         begun = jax.vmap(lambda _: progress.begin())(key)
         none = jnp.zeros(key.shape, jnp.int32)
@@ -73,7 +74,7 @@ def _functions(
         return Takeover(memory, key, script, begun, none)
 
     def act(
-        params: Any, memory: Takeover, state: Any, observe: Observe, t: jax.Array
+        params: Any, memory: Takeover, state: EnvState, observe: Observe, t: jax.Array
     ) -> tuple[Any, Takeover, Any]:
         limits: TakeoverLimits = params[1]
         update = functools.partial(progress.update, stalled_steps=limits.stalled)

@@ -102,7 +102,7 @@ def step(
 def problem(m: mjx.Model, d: mjx.Data) -> Problem:
     """Returns the problem of a state with computed positions, velocities and actuators."""
     rows = d._impl
-    root = jnp.sqrt(rows.efc_D)  # of the stiffness: the metric becomes Euclidean
+    root = jnp.sqrt(rows.efc_D)  # stiffness' root: the metric becomes Euclidean
     return Problem(
         M=rows.M,
         f=d.qfrc_smooth,
