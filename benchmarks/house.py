@@ -151,6 +151,9 @@ def figures(root: pathlib.Path) -> dict[str, tuple[float, ...]]:
         "lines with a comment, % of all lines": (
             round(100 * total(source, 2) / total(source, 0), 2),
         ),
+        "lines with a comment, % of the core's code lines": (
+            round(100 * total(core, 2) / total(core, 1), 2),
+        ),
         "comments that begin with 'of'": (
             sum(bool(re.match(r"#:?\s*of\b", text)) for text in comments),
         ),

@@ -15,8 +15,7 @@ import numpy as np
 from starjax import rcm
 from starjax.core.types import Pose
 from starjax.sim import bodies, endoscope_camera, workspaces
-from starjax.sim.task import Outline, SimReadings, Slot, Task, TaskStatus, TaskText
-from starjax.tasks import outlines
+from starjax.sim.task import SimReadings, Slot, Task, TaskStatus, TaskText
 from starjax.tasks.needle_pick import task as pick
 
 if TYPE_CHECKING:  # a robot loads tasks without the simulator
@@ -220,11 +219,6 @@ TEXT = TaskText(
 )
 
 
-def outline(m: "mujoco.MjModel") -> Outline:
-    """Returns the rectangle of the foam below the plate."""
-    return Outline((outlines.rectangle(m, "foam"),), ())
-
-
 TASK = Task(
     name="needle_regrasp",
     mjcf="tasks/needle_regrasp/needle_regrasp.xml",
@@ -248,6 +242,6 @@ TASK = Task(
     relative=pick.relative,
     is_sound=is_sound,
     drive=drive,
-    outline=outline,
+    outline=pick.outline,
     endoscope=workspaces.BOARD_ENDOSCOPE,
 )
