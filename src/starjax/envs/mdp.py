@@ -102,12 +102,14 @@ def make(settings: EnvSettings) -> Episodes:
         return env.reset(key_env, envs.EnvParams(draw(key_trocar)))
 
     def scaled(state: Any, pose: Pose) -> jax.Array:
+        # to [-1, 1]
         return (2.0 * space.encode(pose, state.measured_trocar) - high - low) / (high - low)
 
     def decode(state: Any, action: jax.Array) -> Command:
         parts = jnp.clip(action, -1.0, 1.0).reshape(task.arms, space.dim + 1)
         target, jaws = parts[:, :-1], parts[:, -1]
         if is_relative:
+            # From the measured pose, not the last command: errors do not add up.
             target = jnp.clip(scaled(state, state.pose) + SHARE * target, -1.0, 1.0)
         pose, _ = space.decode(0.5 * (high + low + (high - low) * target), state.measured_trocar)
         command = Command(pose, jaws)
@@ -127,6 +129,7 @@ def make(settings: EnvSettings) -> Episodes:
         return is_terminated(state) | (state.step >= max_steps)
 
     def step(state: Any, action: jax.Array) -> Any:
+        # stands still once over
         return env.step(state.replace(done=is_over(state)), decode(state, action))
 
     def judge(before: Any, after: Any) -> Outcome:
@@ -134,8 +137,9 @@ def make(settings: EnvSettings) -> Episodes:
         if settings.reward == "sparse":
             reward = after.success.astype(jnp.float32)
         else:
+            # A failure costs the rest of the episode: to end early must never pay.
             left = jnp.where(terminated & ~after.success, max_steps - after.step, 0)
-            reward = after.reward - 1.0 - left
+            reward = after.reward - 1.0 - left  # below 0 until success: haste pays
         return Outcome(jnp.where(is_over(before), 0.0, reward), terminated, is_late & ~terminated)
 
     return Episodes(

@@ -40,6 +40,7 @@ def actions(task: Task, space: rcm.ActionSpace) -> tuple[np.ndarray, np.ndarray]
     for slot, low, high in zip(task.slots, *tips(task), strict=True):
         work = registries.workspaces.get(slot.workspace)
         turn = np.linspace(*work.azimuth, num=AZIMUTHS)
+        # Extremes of smooth maps lie at the ranges' ends, or near enough on this grid.
         edge = np.meshgrid(work.radius, [*work.polar, np.mean(work.polar)], turn)
         trocar = rcm.Trocar(*(x.ravel()[:, None] for x in edge))
         frame = rcm.trocar_frame(trocar, np.array(slot.p_world_ref), slot.roll_zero)

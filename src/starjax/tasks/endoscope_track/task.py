@@ -152,7 +152,7 @@ def looking_at(
 
     The view may lean from the shaft in the plane of the image's vertical, as with oblique optics.
     """
-    lean = R_tip_camera[2, 1], -R_tip_camera[2, 2]
+    lean = R_tip_camera[2, 1], -R_tip_camera[2, 2]  # sine and cosine of the optics' angle
     camera = endoscope_camera.looking_at(target, p_trocar, distance, UP, lean)
     return Pose(camera.R @ R_tip_camera.T, camera.p)
 
@@ -166,6 +166,7 @@ def tips(bound: TrackBound, layout: TrackLayout, p_trocars: jax.Array) -> jax.Ar
 
 def path(layout: TrackLayout, time: jax.Array) -> jax.Array:
     """Returns the target's commanded position `[3]` m, `time` s after reset."""
+    # A sum of sines of drawn rates and phases: smooth, and no two trials are alike.
     waves = jnp.array(SHARES) @ jnp.sin(layout.rate * time + layout.phase)
     return jnp.array(CENTRE) + jnp.array(REACH) * waves
 
@@ -186,13 +187,13 @@ def measure(
     """Measures the target in the image and counts the steps off target."""
     target, tip = readings.qpos[bound.target], jax.tree.map(lambda leaf: leaf[0], readings.pose)
     camera = Pose(tip.R @ bound.R_tip_camera, tip.p + tip.R @ bound.p_tip_camera)
-    x, y, z = camera.R.T @ (target - camera.p)
+    x, y, z = camera.R.T @ (target - camera.p)  # in the camera, which looks along -z
     depth = jnp.maximum(-z, 1e-6)
-    aside = jnp.stack([x, y]) / (2.0 * bound.half * depth)
-    off = jnp.where(z < 0, jnp.linalg.norm(aside), 9.0)
+    aside = jnp.stack([x, y]) / (2.0 * bound.half * depth)  # in sides of the picture
+    off = jnp.where(z < 0, jnp.linalg.norm(aside), 9.0)  # behind the lens: far off
     is_seen = (z < 0) & (jnp.max(jnp.abs(aside)) < 0.5)
     across, along = jnp.array(UP) @ camera.R[:, 0], jnp.array(UP) @ camera.R[:, 1]
-    tilt = jnp.abs(jnp.arctan2(across, along))
+    tilt = jnp.abs(jnp.arctan2(across, along))  # rad between the picture's up and the world's
     distance = jnp.linalg.norm(target - camera.p)
     is_near = jnp.abs(distance - DISTANCE) < FAR * DISTANCE
     on_target = (off < OFF_CENTRE) & (tilt < TILT) & is_near
@@ -222,7 +223,7 @@ def status(bound: TrackBound, layout: TrackLayout, measurements: TrackMeasuremen
     success_now = is_over & may_succeed
     stage = (measurements.off < 0.5).astype(jnp.int32) + measurements.on_target
     stage = jnp.where(success_now, 3, stage).astype(jnp.int32)
-    kept = (measurements.step - measurements.missed) / LAST
+    kept = (measurements.step - measurements.missed) / LAST  # share of the time on target
     fraction = jnp.where(
         measurements.on_target, jnp.clip(kept, 0.0, 1.0), jnp.exp(-measurements.off / OFF_CENTRE)
     )

@@ -78,11 +78,13 @@ def measure(
     needle, touch = bodies.free_pose(readings.qpos, bound.needle), readings.touch
     is_up = needle.p[2] > bound.height + single.LIFT
     lifted, passed = is_up & touch[0] & ~touch[1], jnp.zeros((), bool)
-    here = needle.R.T @ (readings.pose.p[1] - needle.p)
+    here = needle.R.T @ (readings.pose.p[1] - needle.p)  # taker's tip in the needle's frame
     grip, untouched = here, jnp.zeros((), jnp.int32)
     if before is not None:
         is_alone = touch[1] & ~touch[0]
         lifted = before.lifted | lifted
+        # Only after the giver has held it alone in the air: a needle that is picked up by the
+        # taker is not handed over.
         passed = before.passed | (before.lifted & is_up & is_alone)
         was_alone = before.touch[1] & ~before.touch[0]
         # A hold restarts once the needle has slipped too far.
@@ -96,7 +98,7 @@ def measure(
         lifted=lifted,
         passed=passed,
         grip=grip,
-        slip=jnp.linalg.norm(here - grip),
+        slip=jnp.linalg.norm(here - grip),  # m since the hold began
         untouched=untouched,
     )
 

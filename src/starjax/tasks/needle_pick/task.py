@@ -92,11 +92,12 @@ class NeedleBound(NamedTuple):
 def segments() -> tuple[np.ndarray, np.ndarray]:
     """Returns centres `[K, 3]` m and tangents `[K, 3]` of the segments in the needle's frame."""
     half = SWEEP / SEGMENTS / 2
-    middle = (np.arange(SEGMENTS) - (SEGMENTS - 1) / 2) * 2 * half
+    middle = (np.arange(SEGMENTS) - (SEGMENTS - 1) / 2) * 2 * half  # rad on the arc, symmetric
     zero = np.zeros(SEGMENTS)
+    # middles of chords: inside the arc
     centres = RADIUS * np.cos(half) * np.stack([np.cos(middle), np.sin(middle), zero], -1)
     tangents = np.stack([-np.sin(middle), np.cos(middle), zero], -1)
-    centres = centres - centres.mean(0)
+    centres = centres - centres.mean(0)  # origin at the centre of mass
     return centres.astype(np.float32), tangents.astype(np.float32)
 
 
@@ -161,6 +162,7 @@ def status(
     """Tests strict success (lifted, held, without slip) and loose success (lifted)."""
     height = measurements.needle.p[2] - bound.height
     lifted = height > LIFT
+    # A point that sticks in a pad would pass for a hold.
     success_now = lifted & measurements.touch & (measurements.slip < SLIP) & ~measurements.sticks
     stage = jnp.where(measurements.touch, 1, 0)
     stage = jnp.where(measurements.touch & lifted, 2, stage)
@@ -182,6 +184,7 @@ def relative(state: jax.Array, tips: jax.Array) -> jax.Array:
     """Returns `[..., 6]`: from the tip to the needle, in the world's and in the needle's frame."""
     off = state[..., :3] - tips[..., 0, :]
     needle = rcm.rot6d_decode(state[..., 3:9])
+    # R' off: in the needle
     turned = jnp.einsum("...ji,...j->...i", needle, off, precision="highest")
     return jnp.concatenate([off, turned], axis=-1) / NEAR
 

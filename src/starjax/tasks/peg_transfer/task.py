@@ -159,6 +159,7 @@ def status(bound: PegBound, layout: PegLayout, measurements: PegMeasurements) ->
     """Tests strict success (threaded, released, at rest) and loose success (SurRoL's test)."""
     block, peg = measurements.block, layout.target_peg
     threaded = is_threaded(block, peg)
+    # Released: jaws that still touch could carry it away.
     success_now = threaded & is_at_rest(measurements.velocity) & ~measurements.touch
     near, lifted = is_near(block, peg), block.p[2] > RIM_HEIGHT + LIFTED
     over = jnp.sum((block.p[:2] - peg) ** 2) < LOOSE_XY**2
@@ -213,6 +214,7 @@ def around(bound: PegBound, block: Pose) -> Capsules:
     pegs = jnp.asarray(bound.pegs)
     foot = jnp.concatenate([pegs, jnp.zeros((len(pegs), 1))], axis=-1)
     normals = wall_normals(block)
+    # half a side: r tan 60 degrees
     half = jnp.sqrt(3.0) * RIM_RADIUS * jnp.cross(block.R[:, 2], normals)
     middle = block.p + RIM_RADIUS * normals
     return Capsules(
@@ -231,12 +233,15 @@ def is_sound(bound: PegBound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
 def wall_normals(block: Pose) -> jax.Array:
     """Returns the walls' outward normals in the world, rows of `[3, 3]`."""
     angle = jnp.arange(WALLS) * (2 * jnp.pi / WALLS)
+    # unit vectors at 0, 120 and 240 degrees
     in_block = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros(WALLS)], axis=-1)
     return in_block @ block.R.T
 
 
 def is_threaded(block: Pose, peg: jax.Array) -> jax.Array:
     """Returns True if the block stands on the board with the peg `[2]` m inside its opening."""
+    # The peg is inside the triangle if it lies behind all three walls: the largest distance
+    # decides.
     reach = jnp.max(wall_normals(block)[:, :2] @ (peg - block.p[:2]))
     stands = jnp.abs(block.p[2] - RIM_HEIGHT) < HEIGHT_TOLERANCE
     return (reach < RIM_RADIUS - WALL_RADIUS) & stands & (block.R[2, 2] > UPRIGHT_COS)

@@ -74,11 +74,12 @@ def measure(
     """Measures the block, the jaws, and its holders."""
     block = bodies.free_pose(readings.qpos, bound.block)
     touch = readings.touch
-    in_air = block.p[2] > single.RIM_HEIGHT + single.LIFTED
+    in_air = block.p[2] > single.RIM_HEIGHT + single.LIFTED  # higher than it stands
     lifted, passed = in_air & touch[0] & ~touch[1], jnp.zeros((), bool)
     untouched = jnp.zeros((), jnp.int32)
     if before is not None:
         lifted = before.lifted | lifted
+        # On the board it could be put down by one tool and picked up by the other.
         passed = before.passed | (before.lifted & in_air & touch[1] & ~touch[0])
         untouched = jnp.where(touch.any(), 0, before.untouched + 1)
     return BimanualMeasurements(
@@ -100,7 +101,7 @@ def status(
     threaded, near = single.is_threaded(block, peg), single.is_near(block, peg)
     is_left = single.is_at_rest(measurements.velocity) & ~measurements.touch.any()
     success_now = threaded & measurements.passed & is_left
-    lost = measurements.lifted & (measurements.untouched > DROPPED_STEPS) & ~threaded
+    lost = measurements.lifted & (measurements.untouched > DROPPED_STEPS) & ~threaded  # dropped
     lifted, passed = measurements.lifted, measurements.passed
     stage = rewards.last_reached(
         measurements.touch[0], lifted, passed, passed & near, passed & threaded, success_now

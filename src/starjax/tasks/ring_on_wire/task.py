@@ -135,7 +135,7 @@ def sample(bound: RingBound, key: jax.Array) -> RingLayout:
     """Draws the end, the ring's position and yaw, and the tip's start."""
     key_start, key_place, key_yaw, key_tip = jax.random.split(key, 4)
     start = jax.random.randint(key_start, (), 0, 2)
-    way = 1.0 - 2.0 * start
+    way = 1.0 - 2.0 * start  # direction along y: +1 or -1
     aside = jax.random.uniform(key_place, minval=-START_SPREAD, maxval=START_SPREAD)
     y = -way * START + aside
     yaw = jax.random.uniform(key_yaw, minval=-YAW, maxval=YAW)
@@ -159,6 +159,7 @@ def measure(
     rubs = bodies.touch(readings.contacts, bound.tube, bound.wire)
     rubbed = jnp.zeros((), jnp.int32)
     if before is not None:
+        # Straight ends are free: the ring hangs on them before and after.
         rubbed = before.rubbed + (rubs & (jnp.abs(ring.p[1]) < -BENDS[1]))
     return RingMeasurements(
         ring=ring,
@@ -173,9 +174,9 @@ def measure(
 def status(bound: RingBound, layout: RingLayout, measurements: RingMeasurements) -> TaskStatus:
     """Tests strict success (at the end, few touches, released, at rest) and loose (at the end)."""
     p, way = measurements.ring.p, layout.way * measurements.ring.p[1]
-    raised = p[2] - (height(p[1]) - HANG)
+    raised = p[2] - (height(p[1]) - HANG)  # m above where it would hang
     at_end = (way > END) & (way < -BENDS[0])
-    hangs = at_end & (jnp.abs(raised) < HANG_TOLERANCE)
+    hangs = at_end & (jnp.abs(raised) < HANG_TOLERANCE)  # let go of, it hangs on the wire
     may = measurements.rubbed <= MAY_TOUCH
     success_now = hangs & may & ~measurements.touch & is_at_rest(measurements.velocity)
     touch, is_lifted = measurements.touch, measurements.touch & (raised > LIFTED)
