@@ -93,6 +93,7 @@ def test_the_nearest_flag_is_suggested():
     [
         ("run --train.stepps 3", {"jax", "mujoco", "numpy"}),
         ("run --seed -1", {"jax", "mujoco", "numpy"}),
+        ("evaluate x --seed -1", {"jax", "mujoco"}),
         ("sweep x --trocars 0", {"jax", "mujoco"}),
         ("stress --policy compact --disturbance rain", {"jax", "mujoco"}),
         ("run --demos.randomise rain=1", {"jax", "mujoco", "numpy"}),

@@ -11,11 +11,9 @@ from starjax.cli import (
     benchmark_args,
     messages,
     options,
-    plan_text,
     policy_args,
     scenes,
     session,
-    stage_times,
 )
 from starjax.cli.folders import is_under_way
 from starjax.core import config as config_lib
@@ -55,7 +53,7 @@ def main(argv: Sequence[str]) -> int:
     args, path, folder = session.for_device(
         functools.partial(_parse, argv), *session.POLICY_MODULES
     )
-    from starjax.cli import policy_evaluation
+    from starjax.cli import plan_text, policy_evaluation, stage_times
 
     who, config = policy_args.load(path)
     args = benchmark_args.with_trials(args, "evaluate", who.env.names.task)
