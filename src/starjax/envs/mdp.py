@@ -18,7 +18,7 @@ and is truncated when time is up. One that is over stays as it is, at reward 0.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,9 @@ from starjax.core import errors, extras
 from starjax.core.types import Command, Pose
 from starjax.envs import ranges, trocar_draws
 from starjax.envs.settings import EnvSettings
+
+if TYPE_CHECKING:  # it needs the extra sim, which `make` asks for
+    from starjax.sim.state import EnvState
 
 SHARE = 0.1  # part of half an action's range, in a control step: of a tip 0.15 m/s, as the arms can
 
@@ -97,15 +100,15 @@ def make(settings: EnvSettings) -> Episodes:
     max_steps = round(task.time_limit_s * env.control_hz)
     max_steps = min(max_steps, settings.max_episode_steps or max_steps)
 
-    def reset(key: jax.Array) -> Any:
+    def reset(key: jax.Array) -> "EnvState":
         key_trocar, key_env = jax.random.split(key)
         return env.reset(key_env, envs.EnvParams(draw(key_trocar)))
 
-    def scaled(state: Any, pose: Pose) -> jax.Array:
+    def scaled(state: "EnvState", pose: Pose) -> jax.Array:
         # to [-1, 1]
         return (2.0 * space.encode(pose, state.measured_trocar) - high - low) / (high - low)
 
-    def decode(state: Any, action: jax.Array) -> Command:
+    def decode(state: "EnvState", action: jax.Array) -> Command:
         parts = jnp.clip(action, -1.0, 1.0).reshape(task.arms, space.dim + 1)
         target, jaws = parts[:, :-1], parts[:, -1]
         if is_relative:
@@ -116,23 +119,23 @@ def make(settings: EnvSettings) -> Episodes:
         p_world_trocar = state.measured_trocar.p_world_trocar
         return wrists.through(task, command, p_world_trocar) if bends else command
 
-    def encode(state: Any, command: Command) -> jax.Array:
+    def encode(state: "EnvState", command: Command) -> jax.Array:
         target = scaled(state, command.pose)
         if is_relative:
             target = (target - scaled(state, state.pose)) / SHARE
         return jnp.concatenate([target, command.gripper[:, None]], axis=-1).ravel()
 
-    def tool(state: Any) -> jax.Array:
+    def tool(state: "EnvState") -> jax.Array:
         return jnp.concatenate([scaled(state, state.pose), state.gripper[:, None]], axis=-1).ravel()
 
-    def is_over(state: Any) -> jax.Array:
+    def is_over(state: "EnvState") -> jax.Array:
         return is_terminated(state) | (state.step >= max_steps)
 
-    def step(state: Any, action: jax.Array) -> Any:
+    def step(state: "EnvState", action: jax.Array) -> "EnvState":
         # stands still once over
         return env.step(state.replace(done=is_over(state)), decode(state, action))
 
-    def judge(before: Any, after: Any) -> Outcome:
+    def judge(before: "EnvState", after: "EnvState") -> Outcome:
         terminated, is_late = is_terminated(after), after.step >= max_steps
         if settings.reward == "sparse":
             reward = after.success.astype(jnp.float32)
@@ -176,12 +179,12 @@ def _space(settings: EnvSettings, task: Any) -> rcm.ActionSpace:
     return rcm.action_space(name, wrist)
 
 
-def is_terminated(state: Any) -> jax.Array:
+def is_terminated(state: "EnvState") -> jax.Array:
     """Returns True if an episode ended before its time."""
     return state.success | state.lost | state.invalid
 
 
-def measure(state: Any) -> dict[str, jax.Array]:
+def measure(state: "EnvState") -> dict[str, jax.Array]:
     """Returns the content of `info`; `rcm_error` in m is the arms' largest executed one."""
     return {
         "is_success": state.success,

@@ -101,22 +101,22 @@ def _array(shape: tuple[int, ...], kind: Any, result: Any) -> Fault:
     return None
 
 
-def _same_shape(task: Task, args: Any, result: Any, index: int) -> Fault:
+def _same_shape(task: Task, args: tuple[Any, ...], result: Any, index: int) -> Fault:
     return _array(jnp.shape(args[index]), jnp.floating, result)
 
 
-def _sample(task: Task, args: Any, result: Any) -> Fault:
+def _sample(task: Task, args: tuple[Any, ...], result: Any) -> Fault:
     for path, leaf in jax.tree_util.tree_leaves_with_path(result):
         if not hasattr(leaf, "dtype") and not isinstance(leaf, bool | int | float):
             return f"arrays, at {jax.tree_util.keystr(path)} too", type(leaf).__name__
     return None
 
 
-def _tips(task: Task, args: Any, result: Any) -> Fault:
+def _tips(task: Task, args: tuple[Any, ...], result: Any) -> Fault:
     return _array((task.arms, 3), jnp.floating, result)
 
 
-def _measure(task: Task, args: Any, result: Any) -> Fault:
+def _measure(task: Task, args: tuple[Any, ...], result: Any) -> Fault:
     """Compares measurements with those of the step before: a loop carries them."""
     if args[3] is None:
         return None
@@ -137,7 +137,7 @@ def _text(shapes: dict[str, tuple[list[int], str]], name: str) -> str:
     return "{1} {0}".format(*shapes[name]) if name in shapes else "none"
 
 
-def _status(task: Task, args: Any, result: Any) -> Fault:
+def _status(task: Task, args: tuple[Any, ...], result: Any) -> Fault:
     if not isinstance(result, TaskStatus):
         return "a TaskStatus", type(result).__name__
     for name, kind in _SCALARS.items():
@@ -146,21 +146,21 @@ def _status(task: Task, args: Any, result: Any) -> Fault:
     return None
 
 
-def _state(task: Task, args: Any, result: Any) -> Fault:
+def _state(task: Task, args: tuple[Any, ...], result: Any) -> Fault:
     if jnp.shape(result) != (task.state_size,):
         fields = " + ".join(f"{field.size} of {field.name}" for field in task.fields)
         return f"[{task.state_size}] numbers: {fields}", str(list(jnp.shape(result)))
     return _array((task.state_size,), jnp.floating, result)
 
 
-def _relative(task: Task, args: Any, result: Any) -> Fault:
+def _relative(task: Task, args: tuple[Any, ...], result: Any) -> Fault:
     leading = jnp.shape(args[0])[:-1]
     if jnp.shape(result)[:-1] != leading:
         return f"an array {[*leading, 'K']}", str(list(jnp.shape(result)))
     return None
 
 
-def _label(task: Task, args: Any, result: Any) -> Fault:
+def _label(task: Task, args: tuple[Any, ...], result: Any) -> Fault:
     names = list(result) if isinstance(result, dict) else [type(result).__name__]
     if sorted(names) != sorted(task.labels):
         return f"a dict of {', '.join(task.labels) or 'nothing'}", ", ".join(names) or "nothing"
@@ -170,7 +170,7 @@ def _label(task: Task, args: Any, result: Any) -> Fault:
     return None
 
 
-def _obstacles(task: Task, args: Any, result: Any) -> Fault:
+def _obstacles(task: Task, args: tuple[Any, ...], result: Any) -> Fault:
     if not isinstance(result, Capsules):
         return "Capsules", type(result).__name__
     count = len(jnp.shape(result.radius)) == 1 and jnp.shape(result.radius)[0]
@@ -180,19 +180,19 @@ def _obstacles(task: Task, args: Any, result: Any) -> Fault:
     return None
 
 
-def _is_sound(task: Task, args: Any, result: Any) -> Fault:
+def _is_sound(task: Task, args: tuple[Any, ...], result: Any) -> Fault:
     return _array((), jnp.bool_, result)
 
 
-def _still(task: Task, args: Any, result: Any) -> Fault:
+def _still(task: Task, args: tuple[Any, ...], result: Any) -> Fault:
     return _pose((len(jnp.atleast_2d(result.p)),), result) if _is_pose(result) else _no_pose(result)
 
 
-def _outline(task: Task, args: Any, result: Any) -> Fault:
+def _outline(task: Task, args: tuple[Any, ...], result: Any) -> Fault:
     return None if isinstance(result, Outline) else ("an Outline", type(result).__name__)
 
 
-def _act(task: Task, args: Any, result: Any) -> Fault:
+def _act(task: Task, args: tuple[Any, ...], result: Any) -> Fault:
     if not isinstance(result, tuple) or len(result) != 3:
         count = f" of {len(result)}" if isinstance(result, tuple) else ""
         expected = "a command to execute, the memory, a command to record"
@@ -219,7 +219,7 @@ def _pose(leading: tuple[int, ...], pose: Pose) -> Fault:
     return fault or _array((*leading, 3), jnp.floating, pose.p)
 
 
-def _bind(task: Task, args: Any, result: Any) -> Fault:
+def _bind(task: Task, args: tuple[Any, ...], result: Any) -> Fault:
     return None
 
 

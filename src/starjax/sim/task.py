@@ -222,8 +222,7 @@ class Task(NamedTuple):
         that small networks compute too coarsely from `state`.
       label: (Layout) -> name of `labels` -> int32.
       colours: (Bound, Layout, rgb `[G, 3]`) -> `[G, 3]`, the goal marked.
-      obstacles: (Bound, Layout, Measurements) -> Capsules that shafts may not enter, see
-        `sim.collision`.
+      obstacles: (Bound, Layout, Measurements) -> Capsules that shafts may not enter.
       floor: m, the lowest height that jaws may reach.
       is_sound: (Bound, qpos, qvel) -> bool, False once an object has diverged.
       outline: (mj_model) -> Outline, for figures.
