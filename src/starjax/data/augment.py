@@ -50,7 +50,7 @@ def augment(
     frames = images.reshape((-1, height, width, 3))
     # One draw for all: each would cost XLA on CPU a second of compilation.
     bits = jax.random.bits(key, (len(frames), 6), jnp.uint32)
-    # places of the crop's corner
+    # Places of the crop's corner
     spans = jnp.array([height - crop + 1, width - crop + 1], jnp.uint32)
     corner = (bits[:, :2] % spans).astype(jnp.int32)  # biased by 2^-32 spans: nothing
     if np.ndim(jitter):
@@ -88,7 +88,7 @@ def hash_normal(seed: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     Returns:
       float32 `[N, *shape]`.
     """
-    # same for all frames
+    # Same for all frames
     counter = hashing.lowbias32(jnp.arange(math.prod(shape), dtype=jnp.uint32))
     bits = hashing.lowbias32(seed[:, None] ^ counter)
     low, high = bits & 0x00FF00FF, (bits >> 8) & 0x00FF00FF  # two bytes each, in 16-bit lanes

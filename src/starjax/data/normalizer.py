@@ -182,7 +182,7 @@ def _reach(
     def ends(command):
         def through(trocar):
             frame = rcm.trocar_frame(trocar, p_world_ref, roll_zero)
-            # the same tip through another trocar
+            # The same tip through another trocar
             if wrist is None:
                 pose = rcm.project(command.pose, frame.p_world_trocar)
             else:
@@ -227,7 +227,7 @@ def _min_max(values: np.ndarray, scaled: np.ndarray) -> MinMax:
     constant = high - low < _SMALLEST_RANGE
     middle = 0.5 * (low + high)
     low, high = np.where(constant, middle - 1.0, low), np.where(constant, middle + 1.0, high)
-    # rotations: within [-1, 1], their columns of unit length
+    # Rotations: within [-1, 1], their columns of unit length
     unchanged = np.ones(values.shape[-1], bool)
     unchanged[scaled] = False
     low, high = np.where(unchanged, -1.0, low), np.where(unchanged, 1.0, high)

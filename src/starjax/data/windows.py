@@ -207,7 +207,7 @@ def over_frames(dataset: Dataset, frames: np.ndarray, fn: Callable[..., np.ndarr
     *per_frame, trocars, episode = low
     parts = []
     for i in range(0, len(frames), _CHUNK):
-        # full: one shape, one program
+        # Full: one shape, one program
         frame = frames[np.minimum(np.arange(i, i + _CHUNK), len(frames) - 1)]
         observation, command = _take(per_frame, frame)
         part = np.asarray(fn(observation, command, _take(trocars, np.asarray(episode[frame]))))

@@ -105,7 +105,7 @@ def make(settings: EnvSettings) -> Episodes:
         return env.reset(key_env, envs.EnvParams(draw(key_trocar)))
 
     def scaled(state: "EnvState", pose: Pose) -> jax.Array:
-        # to [-1, 1]
+        # To [-1, 1]
         return (2.0 * space.encode(pose, state.measured_trocar) - high - low) / (high - low)
 
     def decode(state: "EnvState", action: jax.Array) -> Command:
@@ -132,7 +132,7 @@ def make(settings: EnvSettings) -> Episodes:
         return is_terminated(state) | (state.step >= max_steps)
 
     def step(state: "EnvState", action: jax.Array) -> "EnvState":
-        # stands still once over
+        # Stands still once over
         return env.step(state.replace(done=is_over(state)), decode(state, action))
 
     def judge(before: "EnvState", after: "EnvState") -> Outcome:

@@ -85,7 +85,7 @@ def trocar_from_poses(
     axis = R[..., :, 2]
     is_known = jnp.isfinite(axis).all(-1) & (jnp.abs(p) <= _FARTHEST).all(-1)
     axis, length = arrays.direction(arrays.bounded(axis), np.array([0.0, 0.0, -1.0], np.float32))
-    # a rotation's column has length 1
+    # A rotation's column has length 1
     known = (is_known & (length > 0.5) & (length < 2.0)).astype(p.dtype)
     centre = _median(p, known)
     # Positions relative to the centre keep more digits in float32.
@@ -99,7 +99,7 @@ def trocar_from_poses(
     def better(_: int, point: jax.Array) -> jax.Array:
         return _step(point, axis, p, _weight(_distance(point, axis, p), known))
 
-    # robust start: sum of distances
+    # Robust start: sum of distances
     point = jax.lax.fori_loop(0, _COARSE, nearer, jnp.zeros_like(centre))
     point = jax.lax.fori_loop(0, _FINE, better, point)
     weight = _weight(_distance(point, axis, p), known)
@@ -196,7 +196,7 @@ def _weight(distance: jax.Array, known: jax.Array) -> jax.Array:
     """Returns Tukey's weights, scaled by the median distance of known lines."""
     middle = _median(distance[..., None], known)
     deviation = jax.lax.stop_gradient(jnp.maximum(middle / _RAYLEIGH, _FINEST))
-    # zero weight for outliers
+    # Zero weight for outliers
     inside = jnp.maximum(1.0 - (distance / (_CUT * deviation)) ** 2, 0.0)
     return known * inside**2
 

@@ -115,9 +115,9 @@ def project(pose: types.Pose, p_world_trocar: ArrayLike) -> types.Pose:
     unknown = arrays.taint(R.reshape(*R.shape[:-2], 9)) + arrays.taint(p)
     unknown = unknown + arrays.taint(p_world_trocar)
     R, p, p_world_trocar = (arrays.bounded(x) for x in given)
-    # a tip at the trocar keeps its axis
+    # A tip at the trocar keeps its axis
     target, _ = arrays.direction(p - p_world_trocar, R[..., :, 2])
-    # smallest turn about the tip
+    # Smallest turn about the tip
     R = arrays.matmul(rotations.rotation_align(R[..., :, 2], target), R)
     is_known = jnp.isfinite(unknown)
     return types.Pose(

@@ -183,7 +183,7 @@ def bent(wrist: Wrist, angles: jax.Array) -> Pose:
         [-sin_pitch, cos_pitch * sin_yaw, cos_pitch * cos_yaw],
     )
     R = jnp.stack([jnp.stack(row, -1) for row in rows], -2)
-    # direction from the pitch to the yaw axis, in {L}
+    # Direction from the pitch to the yaw axis, in {L}
     clevis = jnp.stack([sin_pitch, zero, cos_pitch], -1)
     return Pose(R, wrist.clevis * clevis + wrist.jaws * R[..., :, 2])  # R = R_y(pitch) R_x(yaw)
 
@@ -242,7 +242,7 @@ def _angles(wrist: Wrist, R: jax.Array, offset: jax.Array) -> jax.Array:
     # In the plane of x and u the shaft runs from the trocar to the pitch axis, `clevis` before
     # the end of v.
     pitch = _arctan2(-along[..., 0], across - wrist.clevis)
-    # from u to the jaws' z, about x
+    # From u to the jaws' z, about x
     yaw = _arctan2(arrays.dot(u, y)[..., 0], arrays.dot(u, z)[..., 0])
     return jnp.stack([pitch, yaw], -1)
 

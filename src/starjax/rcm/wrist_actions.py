@@ -141,5 +141,5 @@ def _turned_z(a: jax.Array, b: jax.Array) -> jax.Array:
     turn = jnp.concatenate([arrays.dot(a, b), arrays.dot(n, jnp.cross(a, b))], -1)
     turn, _ = arrays.direction(turn, _E_X[:2])
     cos, sin = turn[..., :1], turn[..., 1:]
-    # n is horizontal
+    # The axis n is horizontal
     return cos * _E_Z.astype(a.dtype) + sin * jnp.cross(n, jnp.broadcast_to(_E_Z, n.shape))

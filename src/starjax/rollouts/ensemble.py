@@ -81,7 +81,7 @@ def from_policy(
 def weights(horizon: int, t: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Returns the weights `[H]` of the plan of control step `t`, one per planned step, and the sum
     of the weights of all plans for the first of these steps."""
-    # older plans that reach this moment
+    # Older plans that reach this moment
     earlier = jnp.minimum(t, horizon - 1 - jnp.arange(horizon))
     each = jnp.exp(-DECAY * jnp.arange(horizon))
     return each[earlier], jnp.sum(jnp.where(jnp.arange(horizon) <= earlier[0], each, 0.0))

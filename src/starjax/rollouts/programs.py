@@ -156,7 +156,7 @@ def _advancer(
 
         def is_running(loop):
             t, carry, _ = loop
-            # idle lanes do not keep it running
+            # Idle lanes do not keep it running
             return (t < last) & jnp.any(carry.active & ~carry.env.done)
 
         def body(loop):

@@ -24,14 +24,14 @@ def move(scene: scenes.Scene, a: int, state: EnvState, command: Command):
     # Without the correction for load: the reference must not drift with it.
     present = control.corrected(reference, p_trocar, -last_correction)
     measured = state.pose if state.shaft is None else state.shaft
-    # integral feedback
+    # Integral feedback
     correction = control.correct(last_correction, of(measured, a), present, p_trocar)
     wanted = carried_by(bound, command)
     if bound.tool.wrist is None:
         target, velocity = control.toward(
             present, state.velocity[a], wanted, p_trocar, 1.0 / CONTROL_HZ
         )
-        # turned about the tip, against the load
+        # Turned about the tip, against the load
         ik_target = control.corrected(target, p_trocar, correction)
         q, _ = solve(bound, p_trocar, ik_target, q_target, STEP_IK_ITERATIONS)
     else:

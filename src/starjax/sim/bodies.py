@@ -25,7 +25,7 @@ def free_pose(qpos: jax.Array, start: int) -> Pose:
 
 def upright_coords(pose: Pose) -> jax.Array:
     """Returns the 7 coordinates of a free body that is turned about the world's z axis only."""
-    # half the yaw: quaternion (cos, 0, 0, sin)
+    # Half the yaw: quaternion (cos, 0, 0, sin)
     half, zero = 0.5 * jnp.arctan2(pose.R[1, 0], pose.R[0, 0]), jnp.zeros(())
     return jnp.concatenate([pose.p, jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)])])
 

@@ -40,7 +40,7 @@ def chain_of(m: mujoco.MjModel, first: str, site: str, joints: tuple[str, ...] =
             anchor = m.jnt_pos[j] if is_hinge else zero * m.jnt_axis[j]
             offsets.append(p + R @ anchor)
             rotations.append(R @ to_axis @ _about_z(zero) if is_hinge else R @ to_axis)
-            # back to the body's frame
+            # Back to the body's frame
             p, R = (-to_axis.T @ anchor if is_hinge else np.zeros(3)), to_axis.T
     return Chain(
         p_base=_float32(data.xpos[root]),

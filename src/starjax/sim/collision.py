@@ -100,7 +100,7 @@ def _with_scene(
         yield f"arm {a}: links, table", jnp.min(watched, initial=jnp.inf) < bound.arm.link_radius
         yield f"arm {a}: jaws, floor", end < floor - DEPTH
         yield f"arm {a}: shaft, table", jnp.min(shaft[:, 2]) < tool.shaft_radius - DEPTH
-        # contact of two capsules, less the tolerance
+        # Contact of two capsules, less the tolerance
         gap = tool.shaft_radius + obstacles.radius - DEPTH
         apart = distance_sq(shaft[:, None], obstacles.start, obstacles.end)
         yield f"arm {a}: shaft, obstacle", apart < gap**2
@@ -110,7 +110,7 @@ def distance_sq(points: jax.Array, start: jax.Array, end: jax.Array) -> jax.Arra
     """Returns squared distances (m^2) of `points` `[..., 3]` from segments; all broadcast."""
     way, off = end - start, points - start
     square = jnp.maximum(jnp.sum(way * way, axis=-1), 1e-12)
-    # nearest point, on the segment
+    # Nearest point, on the segment
     fraction = jnp.clip(jnp.sum(off * way, axis=-1) / square, 0.0, 1.0)
     return jnp.sum((off - fraction[..., None] * way) ** 2, axis=-1)
 

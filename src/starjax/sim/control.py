@@ -71,7 +71,7 @@ def toward(
     # The rest of the rotation, once the axes are aligned, is a roll about the axis.
     # The smallest rotation between the axes adds no roll: what is left is the twist to make.
     carried = rcm.rotation_align(z_present, z_target) @ present.R
-    # in the plane of both
+    # In the plane of both
     twist = jnp.arctan2(carried[:, 1] @ target.R[:, 0], carried[:, 0] @ target.R[:, 0])
     spin = bounded_step(
         twist[None], velocity[3:4] * period, MAX_SPIN * period, MAX_SPIN_ACCELERATION * period**2

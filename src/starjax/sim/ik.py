@@ -127,11 +127,11 @@ def residual(chain: Chain, target: Pose, q: jax.Array) -> jax.Array:
 def _jacobian(
     chain: Chain, pose: Pose, origins: jax.Array, axes: jax.Array, rotation_weight: float
 ) -> jax.Array:
-    # hinge: v = z x (p_tip - p_joint), w = z
+    # Hinge: v = z x (p_tip - p_joint), w = z
     moves, turns = jnp.cross(axes, pose.p - origins), axes
     if any(chain.slides):
         slides = np.array(chain.slides)[:, None]
-        # slide: v = z, w = 0
+        # Slide: v = z, w = 0
         moves, turns = jnp.where(slides, axes, moves), jnp.where(slides, 0.0, axes)
     return jnp.concatenate([moves.T, rotation_weight * turns.T])
 

@@ -30,6 +30,6 @@ def solve_positive(H: jax.Array, g: jax.Array) -> jax.Array:
         return jax.lax.fori_loop(0, len(g), eliminate, rows)[:, -1]
     for i in range(len(g)):
         pivot = rows[i] / rows[i, i]
-        # all other rows at once
+        # All other rows at once
         rows = jnp.where(index == i, pivot, rows - rows[:, i : i + 1] * pivot)
     return rows[:, -1]

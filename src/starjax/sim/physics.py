@@ -124,7 +124,7 @@ def advance(
         forces, memory = coupling.forces(scene, layout, state, gripper, p_world_trocar)
         data, error = solver.step(mjx_model, data, scene.max_solver_iterations, forces)
         contacts = Contacts(jnp.asarray(data._impl.contact.geom), data._impl.contact.dist)
-        # one bad substep makes the whole period invalid
+        # One bad substep makes the whole period invalid
         error = jnp.maximum(result.solver_error, error)
         # Only what the next substep needs: the rest of mjx.Data would be carried through the
         # loop.
@@ -189,7 +189,7 @@ def is_sound(scene: Scene, state: PhysicsState) -> jax.Array:
 def openings(scene: Scene, qpos: jax.Array) -> jax.Array:
     """Returns the jaws' measured openings `[A]`: -1 closed on nothing, +1 fully open."""
     values = [
-        # without jaws: open
+        # Without jaws: open
         jnp.ones(()) if bound.jaw is None else 2.0 * qpos[bound.jaw] / bound.tool.open - 1.0
         for bound in scene.arms
     ]

@@ -175,7 +175,7 @@ def solve(
 
         # A full Newton step overshoots where a contact changes its zone.
         fraction = line_search(slope, now.gradient @ p)
-        # no new products
+        # No new products
         return at(now.x + fraction * p, now.Mx + fraction * Mp, now.r + fraction * Ap)
 
     start = at(x, M @ x, A @ x - b)
@@ -243,7 +243,7 @@ def half_hessian(problem: Problem, r: jax.Array) -> jax.Array:
     # [C, V] each
     normal, first, second = jnp.moveaxis(A_contacts.reshape(-1, 3, A_contacts.shape[1]), 1, 0)
     x, y = contacts.along[:, :1], contacts.along[:, 1:]
-    # rows turned to the slip's direction
+    # Rows turned to the slip's direction
     along, across = x * first + y * second, x * second - y * first
     mu, sticks = contacts.mu, contacts.sticks
     slips = ~sticks & (contacts.depth > 0)  # the rest is inside the cone: no cost
@@ -289,7 +289,7 @@ def _split(problem: Problem, r: jax.Array) -> tuple[jax.Array, _Contacts]:
     sideways = jnp.where(is_sideways, size, 0.0)
     # Distance mu t - n along the axis; the projection on the cone's normal divides by 1 + mu^2.
     depth = jnp.maximum(mu * sideways - normal, 0.0) / (1.0 + mu**2)
-    # curvature mu / t of the cone's circle, times depth
+    # Curvature mu / t of the cone's circle, times depth
     bend = jnp.where(is_sideways, mu * depth / size, 0.0)
     return others, _Contacts(r, along, mu, mu * normal + sideways <= 0, depth, bend)
 

@@ -169,7 +169,7 @@ def _enter(play: Play, script: HandoverScript, phase: jax.Array, state: EnvState
         goal=goal,
         normal=normals,
         roll_from=script.roll,
-        # jaws are symmetric
+        # Jaws are symmetric
         roll_to=scripting.nearer_half(scripting.turn_to(normals, at_zero), script.roll),
         jaws_from=script.jaws,
     )

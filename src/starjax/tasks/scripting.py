@@ -95,7 +95,7 @@ def turn_to(normal: jax.Array, R: jax.Array) -> jax.Array:
 
 def nearer_half(turned: jax.Array, roll: jax.Array) -> jax.Array:
     """Returns `turned` rad plus a multiple of half a turn (jaws are symmetric), next to `roll`."""
-    # within a quarter turn of `roll`
+    # Within a quarter turn of `roll`
     return roll + (turned - roll + jnp.pi / 2) % jnp.pi - jnp.pi / 2
 
 
@@ -113,7 +113,7 @@ def disturb(key: jax.Array, noise: jax.Array, step: jax.Array, deviation: jax.Ar
     drawn = jax.random.normal(
         jax.random.fold_in(jax.random.fold_in(key, NOISE_STREAM), step), deviation.shape
     )
-    # stationary variance deviation^2
+    # Stationary variance deviation^2
     rough = keep * noise[0] + deviation * jnp.sqrt(1.0 - keep**2) * drawn
     smooth = noise[1] + dt / SMOOTHING * (rough - noise[1])  # first-order low-pass
     return jnp.stack([rough, smooth])

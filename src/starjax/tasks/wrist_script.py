@@ -114,7 +114,7 @@ def commands(
 def _command(script: WristScript, tip: Pose, state: EnvState) -> Command:
     """Returns the command `[1]` of a tip's pose, with the script's jaws."""
     p_trocar: Any = state.measured_trocar.p_world_trocar[0]
-    # the shaft through the trocar, and the wrist's angles
+    # The shaft through the trocar, and the wrist's angles
     found = rcm.through(WRIST, tip, p_trocar)
     pose = Pose(found.pose.R[None], found.pose.p[None])
     return Command(pose, script.jaws[None], found.wrist[None])

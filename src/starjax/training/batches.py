@@ -228,7 +228,7 @@ def disturbed(
     if choice.draws is None:
         return batch
     if displaced is not None:
-        # this step's, of several
+        # This step's, of several
         displaced = jax.tree.map(lambda x: x[:, displaced.index], displaced.images)
     names = list(randomise.max_levels(setup.train_config))
 

@@ -94,7 +94,7 @@ def make_optimizer(train_config: config.TrainConfig) -> optax.GradientTransforma
     """Returns AdamW with Diffusion Policy's betas; the roll network's kernels may decay faster."""
     parts = [
         optax.scale_by_adam(b1=0.95, b2=0.999),  # as Diffusion Policy
-        # decoupled: after the moments (AdamW)
+        # Decoupled: after the moments (AdamW)
         optax.add_decayed_weights(train_config.weight_decay),
     ]
     if train_config.roll_weight_decay:

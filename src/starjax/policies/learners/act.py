@@ -69,7 +69,7 @@ def make(options: ActConfig, policy_config: config.PolicyConfig, sizes: "Sizes")
         }
 
     def prepare(key: jax.Array, x0: jax.Array) -> tuple[jax.Array, jax.Array]:
-        # noise of the style, z = mu + s eps
+        # Noise of the style, z = mu + s eps
         return x0, jax.random.normal(key, (len(x0), options.style_dim))
 
     def loss(
@@ -95,7 +95,7 @@ def make(options: ActConfig, policy_config: config.PolicyConfig, sizes: "Sizes")
         return sequences.cast_params(params, {"kernel"}, dtype)
 
     def prepare_for_inference(params: Params) -> Params:
-        # styles are for training alone
+        # Styles are for training alone
         return {"decoder": kernels.packed(cast_params(params["decoder"]))}
 
     metrics = ("l1", "divergence")

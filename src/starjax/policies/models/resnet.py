@@ -58,7 +58,7 @@ class Stem(nn.Module):
         down, right = math.ceil(height / 4), math.ceil(width / 8)
         pads = ((0, 0), (4, 4 * down + 2 - height), (4, 8 * right + 4 - width), (0, 0))
         y = _convolve(_blocks(jnp.pad(x, pads)), _to_blocks(kernel.astype(x.dtype)), 1, 0)
-        # a block's outputs side by side
+        # A block's outputs side by side
         y = y.reshape(len(x), down, 2, 2 * right, 2, self.features)
         return y[:, :, :, : math.ceil(width / 4)]
 

@@ -64,7 +64,7 @@ def loss(predict: Callable[..., jax.Array], batch: NoisedShortcut) -> jax.Array:
 
     `predict(x, time)` returns it `[B, ...]`, `predict(x, time, rows)` for some rows of the batch.
     """
-    # the teacher learns from the flow alone
+    # The teacher learns from the flow alone
     target = jax.lax.stop_gradient(targets(predict, batch))
     return jnp.mean((predict(batch.x, batch.time) - target) ** 2)
 

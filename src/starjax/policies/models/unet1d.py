@@ -96,7 +96,7 @@ class ConditionalUnet1D(nn.Module):
 
         self.time_in = layers.Dense(4 * self.time_dim)
         self.time_out = layers.Dense(self.time_dim)
-        # two blocks a level
+        # Two blocks a level
         self.film_widths = [c for c in (*widths, widths[-1], *upward) for _ in range(2)]
         size = 2 * sum(self.film_widths)  # scale and bias of every channel
         init = layers.uniform_init(self.time_dim + self.cond_dim)

@@ -49,7 +49,7 @@ def _nearest(
 
         def meet(key, row, features, x, y, kind=kind, first=first):
             t, part = rays.view(kind, x, y, features)
-            # the nearest is the smallest integer
+            # The nearest is the smallest integer
             hit = pack(t, first + scenes.FACES[kind] * row + part)
             return jnp.where((row >= 0) & (hit < key), hit, key)
 

@@ -69,7 +69,7 @@ def act(script: TrackScript, state: EnvState) -> tuple[Command, TrackScript, Com
 
     def way(distance: jax.Array | float) -> jax.Array:
         line = script.start + fraction * (_target(distance, state) - script.start)
-        # parabola, 1 at its middle
+        # Parabola, 1 at its middle
         return line.at[1:].add(4.0 * fraction * (1.0 - fraction) * script.side)
 
     noise = scripting.disturb(script.key, script.noise, state.step, jnp.array(DEVIATION))
@@ -82,7 +82,7 @@ def act(script: TrackScript, state: EnvState) -> tuple[Command, TrackScript, Com
 def _target(distance: jax.Array | float, state: EnvState) -> jax.Array:
     """Returns roll and position `[4]` with the target centred and level at `distance`."""
     measurements = state.measurements
-    # a step ahead: the command takes one
+    # A step ahead: the command takes one
     aim = measurements.target + measurements.velocity / CONTROL_HZ
     R_tip_camera = state.pose.R[0].T @ measurements.camera.R  # fixed: the camera rides on the tip
     pose = looking_at(aim, state.measured_trocar.p_world_trocar[0], distance, R_tip_camera)

@@ -43,13 +43,13 @@ def _command(roll: jax.Array, p: jax.Array, jaws: jax.Array, state: EnvState) ->
     if state.wrist is None:
         return straight
     zero = state.measured_trocar.roll_zero
-    # same lean at every trocar
+    # Same lean at every trocar
     R = upright(rcm.rotation_from_axis_roll(jnp.asarray(AXES), roll + zero))
     share = scripting.sloped(jnp.clip(state.step / (BEND * CONTROL_HZ), 0.0, 1.0))
     # A wrist cannot jump: from the straight start to the lean along the geodesic.
     turn = share * jax.vmap(ik.rotation_between)(straight.pose.R, R)
     R = Rotation.from_rotvec(turn).as_matrix() @ straight.pose.R
-    # shaft and angles
+    # Shaft and angles
     feasible = rcm.through(WRIST, Pose(R, p), state.measured_trocar.p_world_trocar)
     return Command(feasible.pose, jaws, feasible.wrist)
 

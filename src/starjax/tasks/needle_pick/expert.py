@@ -86,7 +86,7 @@ def _enter(script: NeedleScript, phase: jax.Array, state: EnvState) -> NeedleScr
         # Fixed once the wire is held: the needle turns with the jaws, and would turn them on and
         # on.
         normal=jnp.where(phase <= DESCEND, phases.towards_arm(out), script.normal),
-        # one turn for approach and descent
+        # One turn for approach and descent
         roll_from=jnp.where(phase <= APPROACH, script.roll, script.roll_from),
     )
 

@@ -94,7 +94,7 @@ def segments() -> tuple[np.ndarray, np.ndarray]:
     half = SWEEP / SEGMENTS / 2
     middle = (np.arange(SEGMENTS) - (SEGMENTS - 1) / 2) * 2 * half  # rad on the arc, symmetric
     zero = np.zeros(SEGMENTS)
-    # middles of chords: inside the arc
+    # Middles of chords: inside the arc
     centres = RADIUS * np.cos(half) * np.stack([np.cos(middle), np.sin(middle), zero], -1)
     tangents = np.stack([-np.sin(middle), np.cos(middle), zero], -1)
     centres = centres - centres.mean(0)  # origin at the centre of mass

@@ -100,7 +100,7 @@ def _enter(script: PegScript, phase: jax.Array, state: EnvState) -> PegScript:
     tangent = jnp.cross(block.R[:, 2], normals[wall])
     grasp = block.p + task.RIM_RADIUS * normals[wall] + side * GRASP_SIDE * tangent
     grasp = grasp - jnp.array([0.0, 0.0, GRASP_DROP])
-    # approaches of many places, as a policy's will be
+    # Approaches of many places, as a policy's will be
     spread = HOVER_SPREAD * jax.random.normal(key_hover, (3,)) * jnp.array([1.0, 1.0, 0.5])
     hover = task.RIM_HEIGHT - GRASP_DROP + HOVER
     # The tip's position once the block, tilted by now, is upright over the target peg: on its wall,
@@ -129,7 +129,7 @@ def _enter(script: PegScript, phase: jax.Array, state: EnvState) -> PegScript:
         attempt=attempt,
         wall=wall,
         side=side,
-        # the block turns with the jaws
+        # The block turns with the jaws
         normal=jnp.where(phase <= DESCEND, phases.towards_arm(out), script.normal),
         roll_from=jnp.where(phase <= APPROACH, script.roll, script.roll_from),
     )

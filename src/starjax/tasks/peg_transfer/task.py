@@ -214,7 +214,7 @@ def around(bound: PegBound, block: Pose) -> Capsules:
     pegs = jnp.asarray(bound.pegs)
     foot = jnp.concatenate([pegs, jnp.zeros((len(pegs), 1))], axis=-1)
     normals = wall_normals(block)
-    # half a side: r tan 60 degrees
+    # Half a side: r tan 60 degrees
     half = jnp.sqrt(3.0) * RIM_RADIUS * jnp.cross(block.R[:, 2], normals)
     middle = block.p + RIM_RADIUS * normals
     return Capsules(
@@ -233,7 +233,7 @@ def is_sound(bound: PegBound, qpos: jax.Array, qvel: jax.Array) -> jax.Array:
 def wall_normals(block: Pose) -> jax.Array:
     """Returns the walls' outward normals in the world, rows of `[3, 3]`."""
     angle = jnp.arange(WALLS) * (2 * jnp.pi / WALLS)
-    # unit vectors at 0, 120 and 240 degrees
+    # Unit vectors at 0, 120 and 240 degrees
     in_block = jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros(WALLS)], axis=-1)
     return in_block @ block.R.T
 

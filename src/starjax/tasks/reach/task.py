@@ -94,7 +94,7 @@ def status(bound: ReachBound, layout: ReachLayout, measurements: ReachMeasuremen
     off = jnp.linalg.norm(measurements.tip - layout.p)
     at_mark, near = off < TOLERANCE, off < LOOSE
     success_now = at_mark & (measurements.speed < REST_SPEED)
-    # nested conditions: their number is the stage
+    # Nested conditions: their number is the stage
     stage = near.astype(jnp.int32) + at_mark + success_now
     terms = {STAGES[0]: rewards.nearness(off, NEAR)}
     reward = rewards.staged(STAGES, terms, stage, success_now)

@@ -83,7 +83,7 @@ def act(script: RingScript, state: EnvState) -> tuple[Command, RingScript, Comma
 def _following(script: RingScript, state: EnvState) -> jax.Array:
     """Returns the next phase: another carry, or the first one if the tab is not held."""
     is_carry, is_there = script.phase == CARRY, script.stop >= STOPS[-1] - 1e-6
-    # from stop to stop along the wire
+    # From stop to stop along the wire
     following = jnp.where(is_carry & ~is_there, CARRY, script.phase + 1)
     is_held = (script.phase >= LIFT) & (script.phase <= CARRY)
     following = jnp.where(is_held & ~state.measurements.touch, RAISE, following)
@@ -158,7 +158,7 @@ def _carrying(y: jax.Array, lowered: jax.Array, roll: jax.Array, state: EnvState
 def _turned(p: jax.Array, normal: jax.Array, roll: jax.Array, state: EnvState) -> jax.Array:
     """Returns roll and position `[4]` at `p`, jaws along `normal`, the roll nearest to `roll`."""
     R = _command(jnp.append(0.0, p), jnp.zeros(()), state).pose.R[0]
-    # turns the jaws' y axis to the normal
+    # Turns the jaws' y axis to the normal
     turned = jnp.arctan2(-normal @ R[:, 0], normal @ R[:, 1])
     return jnp.append(scripting.nearer_half(turned, roll), p)
 
