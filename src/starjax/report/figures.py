@@ -149,13 +149,13 @@ def _disc(figure: Any, axis: "Axes", run: results.Run, shades: dict[str, str]) -
         axis.legend(loc="upper left", bbox_to_anchor=(0, -0.12), fontsize=7)
     else:
         colours = [shades["ink"] if group[0].seen else style.FAILURE for group in groups]
-        edge = np.repeat(colours, arms)
+        edge = np.repeat(colours, arms).tolist()
         shown = axis.scatter(
             *at.T, c=rates, cmap=style.MAP, vmin=0, vmax=1, s=330, edgecolors=edge, linewidths=1.6
         )
-        for place, value in zip(at, rates):
+        for (x, y), value in zip(at, rates):
             ink = "black" if value > 0.5 else "white"
-            axis.text(*place, f"{100 * value:.0f}", ha="center", va="center", fontsize=7, color=ink)
+            axis.text(x, y, f"{100 * value:.0f}", ha="center", va="center", fontsize=7, color=ink)
         axis.text(
             0, -1.5e3 * _DISC, "orange rim: unseen", ha="center", fontsize=7, color=style.FAILURE
         )

@@ -116,9 +116,9 @@ def _panel(
 def _areas(axis: "Axes", outline: Outline, shades: dict[str, str]) -> None:
     axis.set_axis_off()
     axis.set_aspect("equal")
-    colours = {"facecolor": shades["line"], "edgecolor": shades["muted"]}
+    face, edge = shades["line"], shades["muted"]
     for area in outline.areas:
-        axis.fill(*_flat(area).T, **colours, linewidth=0.6, alpha=0.6)
+        axis.fill(*_flat(area).T, facecolor=face, edgecolor=edge, linewidth=0.6, alpha=0.6)
     for line in outline.lines:
         thick = {"linewidth": 2.0, "solid_capstyle": "round", "zorder": 2}
         axis.plot(*_flat(line).T, color=shades["muted"], **thick)

@@ -204,7 +204,7 @@ def _frame(env: _EnvFns, arms: int, record: episodes.Record) -> dict[str, jax.Sh
     return precompile.Program(one).shapes(jax.random.key(0))
 
 
-def status(env: _EnvFns, carry: RolloutState) -> dict[str, Any]:
+def status(env: Env | _EnvFns, carry: RolloutState) -> dict[str, Any]:
     """Returns the status of N episodes: `over`, `length`, flags, `stage` and `labels`, `[N]`."""
     state = carry.env
     found = {
