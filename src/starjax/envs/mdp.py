@@ -29,7 +29,7 @@ from starjax.core.types import Command, Pose
 from starjax.envs import ranges, trocar_draws
 from starjax.envs.settings import EnvSettings
 
-if TYPE_CHECKING:  # it needs the extra sim, which `make` asks for
+if TYPE_CHECKING:  # it needs the extra sim, which `make` requires
     from starjax.sim.state import EnvState
 
 SHARE = 0.1  # part of half an action's range, in a control step: of a tip 0.15 m/s, as the arms can

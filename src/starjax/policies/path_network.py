@@ -71,8 +71,7 @@ def make(
             more = jnp.repeat(sequences.observation_vector(condition), arms, axis=0)  # [B * A, C]
         found = predict(
             params,
-            # Arms become rows of the batch: one f_phi serves all, as it does not know which arm
-            # it turns.
+            # Arms become rows of the batch: one f_phi serves all of them.
             path.swapaxes(1, 2).reshape(batch * arms, horizon, -1),
             trocar_weight * trocar.reshape(batch * arms, -1),  # 0 hides an input, at equal sizes
             history_weight * history.swapaxes(1, 2).reshape(batch * arms, -1),

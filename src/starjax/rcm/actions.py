@@ -112,7 +112,10 @@ def _decode_rcm3(parts: dict[str, jax.Array], frame: "SpaceFrame") -> types.Pose
 
 
 def _encode_rcm4(pose: types.Pose, frame: "SpaceFrame") -> list[jax.Array]:
-    return [roll_from_zero(pose.R, frame), pose.p]  # (gamma_rel, p_abs): p does not know the trocar
+    return [
+        roll_from_zero(pose.R, frame),
+        pose.p,
+    ]  # (gamma_rel, p_abs): p is the same for any trocar
 
 
 def _decode_rcm4(parts: dict[str, jax.Array], frame: "SpaceFrame") -> types.Pose:

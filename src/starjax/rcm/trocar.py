@@ -132,7 +132,7 @@ def trocar_from_position(p_world_trocar: ArrayLike, p_world_ref: ArrayLike) -> T
     x, y, z = (offset[..., i] for i in range(3))
     # Here arctan2 has no derivative or an unbounded one.
     is_ref, is_above = (length <= arrays.epsilon(offset.dtype) for length in (radius, across))
-    # arctan2 keeps its digits at the poles, where arccos(z / r) has none.
+    # arctan2 keeps its digits at the poles, unlike arccos(z / r).
     polar = jnp.arctan2(jnp.where(is_ref, 1.0, across), z)
     azimuth = jnp.arctan2(jnp.where(is_above, 0.0, y), jnp.where(is_above, 1.0, x))
     return Trocar(radius, polar, jnp.where(azimuth < 0.0, azimuth + 2.0 * np.pi, azimuth))

@@ -65,7 +65,7 @@ def from_policy(
 
         total = jax.tree.map(added, memory.total, planned.command)
         mean = jax.tree.map(lambda x: x[:, 0] / whole, total)  # sum of w_i plan_i / sum of w_i
-        # A mean of rotations is none: Gram-Schmidt gives the nearest in its first column.
+        # A mean of rotations needs Gram-Schmidt, which keeps the direction of its first column.
         pose = Pose(rcm.rot6d_decode(rcm.rot6d_encode(mean.pose.R)), mean.pose.p)
         angles, p_world_trocar = mean.wrist, state.measured_trocar.p_world_trocar
         if keeps_to_manifold and wrist is not None:

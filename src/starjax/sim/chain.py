@@ -35,8 +35,7 @@ def chain_of(m: mujoco.MjModel, first: str, site: str, joints: tuple[str, ...] =
             # qpos0: angle of the drawn pose
             to_axis, zero = _from_z(m.jnt_axis[j]), -m.qpos0[m.jnt_qposadr[j]]
             is_hinge = m.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE
-            # A hinge turns about its anchor; a slide has none, and starts at -qpos0 along its
-            # axis.
+            # A hinge turns about its anchor; a slide starts at -qpos0 along its axis.
             anchor = m.jnt_pos[j] if is_hinge else zero * m.jnt_axis[j]
             offsets.append(p + R @ anchor)
             rotations.append(R @ to_axis @ _about_z(zero) if is_hinge else R @ to_axis)

@@ -69,7 +69,7 @@ def toward(
     axis = jnp.where(jnp.linalg.norm(axis) < NO_DIRECTION, z_present, axis)
     z = axis / jnp.maximum(jnp.linalg.norm(axis), 1e-6)
     # The rest of the rotation, once the axes are aligned, is a roll about the axis.
-    # The smallest rotation between the axes adds no roll: what is left is the twist to make.
+    # The smallest rotation between the axes adds no roll; the rest is the twist to make.
     carried = rcm.rotation_align(z_present, z_target) @ present.R
     # In the plane of both
     twist = jnp.arctan2(carried[:, 1] @ target.R[:, 0], carried[:, 0] @ target.R[:, 0])

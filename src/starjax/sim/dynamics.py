@@ -38,7 +38,7 @@ def reset(scene: scenes.Scene, key: jax.Array, params: EnvParams, cameras: Pose)
     ]
     q = tuple(q for q, _ in solved)
     no = jnp.zeros((), bool)
-    # A trocar that is no place ends the episode at once, instead of NaN in its lane.
+    # A trocar that is not finite ends the episode at once, without NaN in its lane.
     is_lost = ~jnp.all(jnp.isfinite(trocar.p_world_trocar))
     state = physics.initial(scene, q, layout, trocar.p_world_trocar)
     # Jaws are open unless the task's objects begin between them.
@@ -131,8 +131,7 @@ def attempt(
     )
     moved = state.replace(
         physics=after,
-        # The reference advances from where it was, not from the measured joints: the servo's lag
-        # would add up.
+        # The reference advances from itself, not from the measured joints: lags would add up.
         q_target=tuple(q + d for q, d in zip(state.q_target, dq, strict=True)),
         # rad/s at the period's end, see `servo_targets`
         q_velocity=tuple(CONTROL_HZ * d for d in dq),

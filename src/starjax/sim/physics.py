@@ -126,8 +126,7 @@ def advance(
         contacts = Contacts(jnp.asarray(data._impl.contact.geom), data._impl.contact.dist)
         # One bad substep makes the whole period invalid
         error = jnp.maximum(result.solver_error, error)
-        # Only what the next substep needs: the rest of mjx.Data would be carried through the
-        # loop.
+        # Only the fields of the next substep: the loop would carry all of mjx.Data.
         state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, memory)
         return state, StepResult(touching(scene, contacts), contacts, before, error)
 

@@ -216,7 +216,7 @@ def line_search(slope: Callable[[jax.Array], jax.Array], first: jax.Array) -> ja
         )
     rise = slopes[1] - slopes[0]
     is_enclosed = jnp.isfinite(rise) & (rise > 0)
-    # Secant, exact but for the cones' curvature where no contact changes its zone.
+    # Secant: exact for contacts that keep their zone, up to the cones' curvature.
     fraction = jnp.where(is_enclosed, -slopes[0] / jnp.where(is_enclosed, rise, 1.0), 1.0)
     return low + (high - low) * jnp.clip(fraction, 0.0, 1.0)
 

@@ -187,7 +187,7 @@ def advance(
     is_over = scripting.is_over(script, timing.jaws, state)
     script = jax.tree.map(lambda a, b: jnp.where(is_over, a, b), after, script)
     elapsed = script.elapsed + 1.0 / CONTROL_HZ
-    # By the time since the phase began, in any phase: jaws that still move go on.
+    # In any phase, by the time since its start: jaws that still move finish their motion.
     jaws = scripting.jaws(script.jaws_from, jnp.asarray(timing.jaws)[script.phase], elapsed)
     s = jnp.clip(elapsed / script.duration, 0.0, 1.0)
     return script.replace(elapsed=elapsed, jaws=jaws), s

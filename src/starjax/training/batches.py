@@ -104,7 +104,7 @@ def streamed(
     disturb = jax.jit(functools.partial(_disturbed, setup))
     stream = gathered(setup, dataset, frames, processes.own(key), first)
     for step, batch in enumerate(stream, first):
-        # The thread gathers what the disturbances observe; its images change on the device.
+        # The thread gathers the observed steps; the device disturbs their images.
         yield disturb(key, np.int32(step), batch, displace(key, step), *data) if data else batch
 
 

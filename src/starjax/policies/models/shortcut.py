@@ -48,7 +48,7 @@ def noised(key: jax.Array, x0: jax.Array) -> NoisedShortcut:
     """
     key_flow, key_noise, key_share = jax.random.split(key, 3)
     at = flow.noised(key_flow, x0)
-    # By place, not by draw: each device has as many, so that their targets have a fixed shape.
+    # By place, not by draw: each device has equally many, and their targets a fixed shape.
     is_whole = jnp.arange(len(x0)) % EVERY == 0
     scale = _expand(jax.random.uniform(key_share, x0.shape[:1]), x0)
     start = scale * jax.random.normal(key_noise, x0.shape, x0.dtype)  # any temperature in [0, 1]

@@ -35,7 +35,7 @@ def spatial_softmax(
     if offset is None:
         return points
     half = jnp.array([image_size], jnp.float32) / 2
-    # Back to the uncropped image: a random crop must not move what the policy points at.
+    # Back to the uncropped image: a random crop must not move the policy's keypoints.
     return points + (offset.astype(jnp.float32) / half)[:, None, :]
 
 

@@ -100,7 +100,7 @@ class StyleEncoder(nn.Module):
         now = layers.Dense(self.width, name="state")(state.astype(self.dtype))[:, None]
         first = self.param("first", _start, (1, self.width)).astype(self.dtype)  # [CLS]: reads all
         x = jnp.concatenate([jnp.broadcast_to(first, now.shape), now, actions], axis=1)
-        # Attention does not know the order of tokens.
+        # Attention is blind to the order of tokens.
         x = _placed(self, x)
         for _ in range(self.layers):
             x = Layer(self.heads, self.mlp, self.dtype)(x)

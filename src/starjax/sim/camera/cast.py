@@ -24,7 +24,7 @@ def cast(
     shaded = jnp.zeros_like(face, bool)
     if shadow and view.R_light_cam is not None:
         shaded = _shaded(scene, grid, view.R_light_cam, c, R, t, face)
-    depth = jnp.where(face >= 0, t, 1.0)  # the background has none: any finite number
+    depth = jnp.where(face >= 0, t, 1.0)  # any finite number for the background
     p = [grid.x * depth, grid.y * depth, -depth]  # the camera looks along -z
     return t, face, shade.light(scene, view, geom_rgb[scene.ids], c, R, p, face, shaded)
 

@@ -58,7 +58,7 @@ def normals(kind: int, c: Array, R: Array, size: Array) -> Array:
     u, half = R[:, :, 2], size[:, 1]
     if kind == scenes.CAPSULE:
         return jnp.concatenate([c, u, half[:, None]], -1)
-    # Of opposite faces only the one towards the camera is seen.
+    # Only one of two opposite faces is visible, the one towards the camera.
     facing = R * jnp.where(jnp.einsum("gij,gi->gj", R, c) < 0, 1.0, -1.0)[:, None]
     flat = -_DISTANT * jnp.swapaxes(facing, 1, 2)  # `[N, 3, 3]`, one row a face
     flat = jnp.pad(flat, ((0, 0), (0, 0), (0, 4)))

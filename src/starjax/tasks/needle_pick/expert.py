@@ -60,11 +60,10 @@ def _enter(script: NeedleScript, phase: jax.Array, state: EnvState) -> NeedleScr
     last = task.SEGMENTS - (1 if state.wrist is None else 2)
     inner = (jnp.arange(task.SEGMENTS) > 0) & (jnp.arange(task.SEGMENTS) < last)
     score = jnp.where(inner, -jnp.abs(normals[:, 0]) / SKEW, -jnp.inf)
-    # Softmax of -|sin| / SKEW: segments whose jaws would open along y, as they do at roll 0, but
-    # not the same one always.
+    # Softmax of -|sin| / SKEW: mostly segments that need little roll, not always the same one.
     drawn = jax.random.categorical(jax.random.fold_in(script.key, attempt), score)
     segment = jnp.where(is_approach, drawn, script.segment)
-    out = phases.horizontal(normals[segment])  # aside of the wire: a descent beside it is seen
+    out = phases.horizontal(normals[segment])  # away from the wire, for a visible descent
     # R_world_needle p_needle + p
     grasp = needle.p + needle.R @ jnp.asarray(MIDDLES)[segment] + jnp.array([0.0, 0.0, GRASP_ABOVE])
     high = state.layout.needle.p[2] + GRASP_ABOVE + LIFT_HEIGHT + TOP

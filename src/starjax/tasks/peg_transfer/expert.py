@@ -95,7 +95,7 @@ def _enter(script: PegScript, phase: jax.Array, state: EnvState) -> PegScript:
     chosen = jax.random.categorical(key_wall, jnp.where(is_candidate, -unlike, -jnp.inf))
     wall = jnp.where(is_approach, chosen, script.wall)
     out = phases.horizontal(normals[wall])  # the block may be tilted
-    # Beside the wall's middle, left or right: two modes of the demonstrations.
+    # Left or right of the wall's middle: two modes of the demonstrations.
     side = jnp.where(is_approach, jax.random.rademacher(key_side, (), jnp.float32), script.side)
     tangent = jnp.cross(block.R[:, 2], normals[wall])
     grasp = block.p + task.RIM_RADIUS * normals[wall] + side * GRASP_SIDE * tangent

@@ -61,7 +61,7 @@ def act(script: ReachScript, state: EnvState) -> tuple[Command, ReachScript, Com
     s = jnp.clip(elapsed / script.duration, 0.0, 1.0)
     fraction = scripting.sloped(s)
     p = script.start + fraction * (state.layout.p - script.start)
-    # A parabola, 1 at its middle: two ways around, so that demonstrations are bimodal.
+    # A parabola, 1 at its middle: two ways around make demonstrations bimodal.
     p = p + 4.0 * fraction * (1.0 - fraction) * script.side
     noise = scripting.disturb(script.key, script.noise, state.step, jnp.full(3, DEVIATION))
     weight = jnp.clip((CALM - s) / CALM, 0.0, 1.0)  # undisturbed at the mark, where it must rest

@@ -108,8 +108,7 @@ def _enter(script: RingScript, phase: jax.Array, state: EnvState) -> RingScript:
     above = at_tab - HOVER * shaft + jnp.array([0.0, HOVER_ASIDE, 0.0]) * side
     progress = state.layout.way * ring.p[1]  # m towards the goal: `way` is the direction, +1 or -1
     stops = jnp.array(STOPS)
-    # The next stop well ahead of the ring: corrections of what was lost on the way come by
-    # themselves.
+    # The next stop well ahead of the ring: a ring that has slipped back is carried again.
     following = jnp.min(jnp.where(stops > progress + AHEAD, stops, STOPS[-1]))
     stop = jnp.where(phase == LIFT, progress, jnp.where(phase == CARRY, following, script.stop))
     on_wire = _carrying(state.layout.way * stop, jnp.zeros(()), here[0], state)
@@ -145,7 +144,7 @@ def _carrying(y: jax.Array, lowered: jax.Array, roll: jax.Array, state: EnvState
     # difference.
     normal = -jnp.stack([jnp.zeros(()), jnp.array(2.0 * SMOOTHED), rise])
     held: Pose = jax.tree.map(lambda leaf: leaf[0], state.pose)
-    in_tool = held.R.T @ (state.measurements.ring.p - held.p)  # p_tip_ring, as it was grasped
+    in_tool = held.R.T @ (state.measurements.ring.p - held.p)  # p_tip_ring of the present grasp
     way = jnp.append(roll, held.p)
     # Fixed point: the roll depends on the tip, which depends on the roll through the grasp.
     for _ in range(ROUNDS):
