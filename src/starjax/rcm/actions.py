@@ -115,7 +115,7 @@ def _encode_rcm4(pose: types.Pose, frame: "SpaceFrame") -> list[jax.Array]:
     return [
         roll_from_zero(pose.R, frame),
         pose.p,
-    ]  # (gamma_rel, p_abs): p is the same for any trocar
+    ]  # (gamma_rel, p_abs): p for any trocar
 
 
 def _decode_rcm4(parts: dict[str, jax.Array], frame: "SpaceFrame") -> types.Pose:

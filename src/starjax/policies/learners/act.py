@@ -76,7 +76,7 @@ def make(options: ActConfig, policy_config: config.PolicyConfig, sizes: "Sizes")
         params: Params, condition: Condition, given: tuple[jax.Array, jax.Array]
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
         x0, noise = given
-        # The encoder sees the demonstrated sequence: the style explains the rest, unseen in observations.
+        # The encoder sees the demonstration: the style explains the rest, unseen in observations.
         style: Any = styles.apply(params["style"], x0, condition.state)
         said = decode(params["decoder"], transformer.drawn(style, noise), *condition)
         # L1, KL to N(0, I)
