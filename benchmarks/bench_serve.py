@@ -1,13 +1,16 @@
-"""Times an inference over the socket and the same policy called in this process.
+"""Times an inference over the socket and in this process, and a robot's topics.
 
-    python benchmarks/bench_serve.py [--policy compact] [--calls 200] [--tiny]
+    python benchmarks/bench_serve.py [--only socket] [--only topics] [--calls 200] [--tiny]
 
 `starjax serve` runs in its own process on this machine. Calls to it and calls here alternate, so
 other load affects both equally. Then the loop drives an ideal robot at 30 Hz and counts missed
-deadlines.
+deadlines. `starjax sim-robot` in its own process takes commands at 120 Hz over ROS 2 topics: a
+round trip ends with the setpoint that answers, at most a period of that robot later.
 """
 
 import argparse
+import subprocess
+import sys
 import time
 
 import _far_robots
@@ -20,25 +23,77 @@ from starjax.deploy import batching, wire
 from starjax.deploy.connection import Connection
 
 LOOP_S = 10.0  # of the robot
+DOMAIN = 77  # of the topics
+LOST_S = 0.5  # after which a command counts as lost: another has replaced it
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--policy", default="compact", help="name or file")
     parser.add_argument("--calls", type=int, default=200, help="of each")
+    parser.add_argument("--only", action="append", choices=("socket", "topics"))
     parser.add_argument("--tiny", action="store_true", help="a test's sizes, nothing is written")
     asked = parser.parse_args()
     runtime.prepare_xla()
     calls, loop_s = (3, 0.5) if asked.tiny else (asked.calls, LOOP_S)
-    policy = deploy.load(asked.policy)
-    server = _far_robots.Server(asked.policy, batch=1)
+    results, only = {}, asked.only or ("socket", "topics")
+    if "topics" in only:
+        results["topics"] = row = topics(10 * calls)
+        for name in ("round_trip", "period"):
+            print(f"topics, {name:10} {row[name]['p50']:6.2f} {row[name]['p99']:8.2f} ms p50, p99")
+    if "socket" in only:
+        results[asked.policy] = socket(asked.policy, calls, loop_s)
+    _timing.report("serve", {"results": results}, asked.tiny)
+
+
+def topics(calls: int) -> dict:
+    """Returns percentiles, ms, of round trips of commands, and of the periods of measurements."""
+    from starjax.addons.robots import bus, messages, psm, robot_file
+
+    argv = [sys.executable, "-m", "starjax", "sim-robot", "--domain", str(DOMAIN)]
+    simulated = subprocess.Popen(argv, stdout=subprocess.DEVNULL)
+    own, times, periods = bus.Bus(robot_file.Network(DOMAIN, "lo")), [], []
+    own.read("/PSM1/setpoint_js", messages.JointState)
+    own.read("/PSM1/measured_js", messages.JointState)
+    try:
+        end = time.perf_counter() + 60.0
+        while "/PSM1/setpoint_js" not in own.newest and time.perf_counter() < end:
+            own.poll()
+        writer = own.writer("/PSM1/servo_jp", messages.JointState, "servo")
+        q = np.array(own.newest["/PSM1/measured_js"].position)
+        time.sleep(1.0)  # readers and writers find each other
+        came = time.perf_counter()
+        for _ in range(calls):
+            q[0] += 1e-5
+            header = messages.Header(messages.stamp(), "PSM1_base")
+            sent = time.perf_counter()
+            writer.write(messages.JointState(header, list(psm.JOINTS), q.tolist()))
+            is_back = False
+            while time.perf_counter() - sent < LOST_S and not is_back:
+                fresh, now = own.poll(), time.perf_counter()
+                if "/PSM1/measured_js" in fresh:
+                    periods.append(1e3 * (now - came))
+                    came = now
+                is_back = own.newest["/PSM1/setpoint_js"].position[0] == q[0]
+                time.sleep(1e-4)
+            if is_back:
+                times.append(1e3 * (time.perf_counter() - sent))
+    finally:
+        simulated.kill()
+    row = {"round_trip": percentiles(times), "period": percentiles(periods[1:])}
+    return {"calls": calls, "lost": calls - len(times), **row}
+
+
+def socket(name: str, calls: int, loop_s: float) -> dict:
+    """Returns times of inferences, and counts of a loop, over the socket."""
+    policy = deploy.load(name)
+    server = _far_robots.Server(name, batch=1)
     try:
         row = decisions(policy, server.address, calls)
         print(f"{'':10}  p50      p95      p99 ms")
-        for name in ("here", "socket", "difference"):
-            print(
-                f"{name:10} {row[name]['p50']:8.2f} {row[name]['p95']:8.2f} {row[name]['p99']:8.2f}"
-            )
+        for part in ("here", "socket", "difference"):
+            p50, p95, p99 = row[part].values()
+            print(f"{part:10} {p50:8.2f} {p95:8.2f} {p99:8.2f}")
         row["loop"] = driven = loop(policy, server.address, loop_s)
         print(
             f"30 Hz for {loop_s:g} s: {driven['missed']} of {driven['plans']} plans late, "
@@ -46,7 +101,7 @@ def main() -> None:
         )
     finally:
         server.kill()
-    _timing.report("serve", {"results": {asked.policy: row}}, asked.tiny)
+    return row
 
 
 def decisions(policy: deploy.Deployed, address: str, calls: int) -> dict:

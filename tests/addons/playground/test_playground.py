@@ -71,6 +71,35 @@ def test_a_proportional_controller_reaches_and_rests(env):
     assert reward.dtype == done.dtype == jnp.float32
 
 
+@pytest.mark.slow
+def test_a_lane_begun_again_as_playground_does_has_its_first_trocar(env):
+    """`wrap_for_brax_training` puts data and observation of the first reset in a finished lane.
+
+    Nothing else may remember the finished episode: a step from there is a step from the reset.
+    """
+    first = jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.key(1), LANES))
+    step = jax.jit(jax.vmap(env.step))
+    action = 0.3 * jnp.ones((LANES, env.action_size))
+    later = step(step(first, action), action)
+    is_done = jnp.arange(LANES) < 2
+
+    def where_done(begun, going):
+        return jnp.where(is_done.reshape(-1, *[1] * (begun.ndim - 1)), begun, going)
+
+    begun = later.replace(
+        data=jax.tree.map(where_done, first.data, later.data),
+        obs=where_done(first.obs, later.obs),
+        done=is_done.astype(jnp.float32),
+    )
+    again, expected = step(begun, action), step(first, action)
+    for leaf, other in zip(jax.tree.leaves(again), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_array_equal(leaf[:2], other[:2])
+    trocars = np.asarray(again.data.trocar.p_world_trocar)[:, 0]
+    np.testing.assert_array_equal(trocars, np.asarray(first.data.trocar.p_world_trocar)[:, 0])
+    assert len(np.unique(trocars, axis=0)) == LANES
+    assert np.asarray(again.data.step).tolist() == [1, 1, 3, 3]
+
+
 def test_tasks_are_in_playgrounds_registry(monkeypatch):
     """A fake of Playground: its registry's signature, and its abstract class."""
     rows, made = {}, []

@@ -1,14 +1,18 @@
-"""A patient side manipulator on CRTK's topics: measurements in, commands out."""
+"""An arm on CRTK's topics: measurements in, commands out.
+
+A patient side manipulator measures its pose itself; that of other arms follows from their joints.
+"""
 
 # pyright: reportArgumentType=false
 # Sequences of messages are lists: see `messages`.
 
-import time
+import io
 from typing import Any, NamedTuple
 
 import numpy as np
+from PIL import Image
 
-from starjax.addons.robots import crtk, messages, psm
+from starjax.addons.robots import crtk, kinematics, messages
 from starjax.addons.robots.bus import Bus
 from starjax.addons.robots.robot_file import VIEW, RobotFile
 from starjax.core.errors import UsageError
@@ -19,6 +23,8 @@ from starjax.deploy.inputs import RobotObservation
 WORLD = "world"  # frame of the policy's world in headers
 _IDENTITY = crtk.pose_of_arrays(np.eye(3), np.zeros(3))
 _ENCODINGS = {"rgb8": False, "bgr8": True}  # True: blue first
+_REPORTS = ("warning", "error")
+MAX_JOINT_STEP = 0.2  # rad and m between two commands: more is another branch of the kinematics
 
 
 class TopicSource(NamedTuple):
@@ -39,44 +45,64 @@ class TopicSource(NamedTuple):
 
 
 class CrtkArm:
-    """Topics of one arm, its camera and its trocar; `measure` and `send` as `deploy.Robot`.
+    """Topics of one arm, its cameras and its trocar; `measure` and `send` as `deploy.Robot`.
 
     It opens no writer before `send`, so it disturbs no other program until then.
 
     Attributes:
-      sources: name -> topic that it reads.
+      kinematics: of the arm. sources: name -> topic that it reads.
       sent: commands so far.
     """
 
     def __init__(self, bus: Bus, file: RobotFile, image_size: int) -> None:
         self.bus, self.file, self.sent = bus, file, 0
+        arm = file.arm
+        self.kinematics = kinematics.of(arm.kind, arm.instrument, arm.task)
+        self._is_psm = arm.kind == kinematics.PSM
         self._size, self._writers = image_size, {}
-        self._base_name = "" if file.arm.frame == VIEW else file.arm.frame
-        self._tip = crtk.tool_tip(file.instrument.wrist)
-        self._q = np.zeros(6)  # joints of the last command
-        at = file.arm.namespace
+        self._base_name = "" if arm.frame == VIEW else arm.frame
+        wrist = self.kinematics.wrist
+        self._tip = _IDENTITY if wrist is None else crtk.tool_tip(wrist)
+        self._q: np.ndarray | None = None  # joints of the last command
         pose, joints = messages.PoseStamped, messages.JointState
+        kinds = {"joints": joints, "jaw": joints, "state": messages.OperatingState}
+        if self._is_psm:
+            kinds |= dict.fromkeys(("pose", "view", "setpoint"), pose)
+        else:
+            kinds |= {"joint_setpoint": joints}
+        profiles = {"state": "latched"}
         self.sources = {
-            "pose": TopicSource(f"{at}/local/measured_cp", pose),
-            "view": TopicSource(f"{at}/measured_cp", pose),
-            "setpoint": TopicSource(f"{at}/setpoint_cp", pose),
-            "joints": TopicSource(f"{at}/measured_js", joints),
-            "jaw": TopicSource(f"{at}/jaw/measured_js", joints),
-            "state": TopicSource(f"{at}/operating_state", messages.OperatingState, "latched"),
+            name: TopicSource(file.topic(name), kind, profiles.get(name, "default"))
+            for name, kind in kinds.items()
         }
         for name, camera in file.cameras.items():
-            self.sources[f"camera {name}"] = TopicSource(camera.topic, messages.Image, "sensor")
+            is_file = camera.topic.endswith("/compressed")
+            kind = messages.CompressedImage if is_file else messages.Image
+            self.sources[f"camera {name}"] = TopicSource(camera.topic, kind, "sensor")
         if file.trocar.topic:
             trocar = TopicSource(file.trocar.topic, messages.PointStamped, "latched")
             self.sources["trocar"] = trocar
         for source in self.sources.values():
             bus.read(*source)
+        for name in _REPORTS:
+            bus.read(file.topic(name), messages.StringStamped)
+        self.forget()
 
     @property
     def commands(self) -> list[str]:
         """Returns the topics that it writes."""
-        at = self.file.arm.namespace
-        return [f"{at}/{self.file.arm.command}", f"{at}/jaw/servo_jp"]
+        return [self.file.topic(name) for name in (self.file.arm.command, "jaw_servo")]
+
+    def forget(self) -> None:
+        """Forgets the last command, and the robot's warnings and errors."""
+        self._q = None
+        for name in _REPORTS:
+            self.bus.newest.pop(self.file.topic(name), None)
+
+    def reports(self) -> list[guard.Doubt]:
+        """Returns the robot's own warnings and errors since `forget`: it refused a command."""
+        newest = [(name, self.bus.newest.get(self.file.topic(name))) for name in _REPORTS]
+        return [guard.Doubt("arm", name, one.string) for name, one in newest if one is not None]
 
     def poll(self) -> list[str]:
         """Reads all topics at once, as of one moment; returns those with a new message."""
@@ -98,7 +124,7 @@ class CrtkArm:
             return guard.Snapshot(None)
         observed, q = self.measure(now), self._joints()
         state = self._newest("state")
-        tip = crtk.compose(self.file.pose_world_base, psm.tip_of(q, self.file.instrument))
+        tip = crtk.compose(self.file.pose_world_base, self.kinematics.tip_of(q))
         return guard.Snapshot(
             observed.pose,
             observed.shaft,
@@ -108,7 +134,7 @@ class CrtkArm:
             is_ready=crtk.is_ready(state),
             commanders=sum(len(self.bus.writers(topic)) for topic in self.commands),
             joints=q,
-            limits=psm.LIMITS,
+            limits=self.kinematics.limits,
             p_joints=tip.p,
         )
 
@@ -120,23 +146,32 @@ class CrtkArm:
         """
         if missing := self.missing():
             raise UsageError("robot", "a message of each topic", f"none of {', '.join(missing)}")
-        now = time.time() if now is None else now
-        ages = [self.age(name, now) for name in ("pose", "joints", "jaw")]
+        now = self.bus.now() if now is None else now
+        measured = [name for name in ("pose", "joints", "jaw") if name in self.sources]
+        ages = [self.age(name, now) for name in measured]
         cameras = [name for name in self.sources if name.startswith("camera ")]
         shown = {name.removeprefix("camera "): self._image(name) for name in cameras}
-        base, at = self.file.pose_world_base, self._base_name
+        base, q = self.file.pose_world_base, self._joints()
+        if self._is_psm:
+            frames = crtk.Frames(base, self._tip, self._base_name)
+            pose = crtk.pose_of(self._newest("pose"), frames)
+        else:
+            pose = crtk.compose(base, self.kinematics.tip_of(q))
         return RobotObservation(
-            pose=crtk.pose_of(self._newest("pose"), crtk.Frames(base, self._tip, at)),
+            pose=pose,
             gripper=np.float32(crtk.opening_of(self._newest("jaw"), self.file.jaw)),
             images=shown or None,
             stamp=now - _oldest(ages),
             image_stamp=now - _oldest([self.age(name, now) for name in cameras]) if shown else None,
-            shaft=crtk.compose(base, psm.shaft_of(self._joints(), self.file.instrument)),
+            shaft=crtk.compose(base, self.kinematics.shaft_of(q)),
             p_world_trocar=self._p_world_trocar() if "trocar" in self.sources else None,
         )
 
     def check_first(self, command: Command) -> list[guard.Doubt]:
         """Compares a command with the robot's setpoint, both in the base frame."""
+        if not self._is_psm:
+            q = crtk.joints_of(self._newest("joint_setpoint"), self._names())
+            return guard.check_first(self._tip_in_base(command), self.kinematics.tip_of(q))
         tool = crtk.Frames(_IDENTITY, _IDENTITY)
         view_base = crtk.pose_view_base(self._newest("view"), self._newest("pose"))
         setpoint = crtk.pose_of(self._newest("setpoint"), tool)
@@ -145,28 +180,33 @@ class CrtkArm:
         return guard.check_first(self._tool(command), setpoint)
 
     def send(self, command: Command) -> None:
-        """Publishes a command and its jaws."""
-        at, stamp = self.file.arm, messages.stamp()
+        """Publishes a command and its jaws.
+
+        Raises:
+          UsageError: the arm does not reach it within its limits; nothing was published.
+        """
+        near = self._joints() if self._q is None else self._q
+        q = self.kinematics.joints_of(self._tip_in_base(command), near)
+        if not (far := float(np.abs(q - near).max())) <= MAX_JOINT_STEP:
+            raise UsageError("joints", f"a step of {MAX_JOINT_STEP:g}", f"{far:.3g} rad or m")
+        stamp = messages.stamp(self.bus.now())
+        message = self._message(command, q, stamp)
         if not self._writers:
-            kinds = messages.JointState if at.command == "servo_jp" else messages.PoseStamped
-            for topic, kind in zip(self.commands, (kinds, messages.JointState), strict=True):
+            kinds = type(message), messages.JointState
+            for topic, kind in zip(self.commands, kinds, strict=True):
                 self._writers[topic] = self.bus.writer(topic, kind, "servo")
         arm, jaw = self.commands
-        self._writers[arm].write(self.message(command, stamp))
-        jaws = messages.JointState(messages.Header(stamp, at.frame), ["jaw"])
+        self._writers[arm].write(message)
+        jaws = messages.JointState(messages.Header(stamp, self.file.arm.frame), ["jaw"])
         self._writers[jaw].write(crtk.fill_jaw(jaws, float(command.gripper), self.file.jaw))
+        self._q = q
         self.sent += 1
 
-    def message(self, command: Command, stamp: messages.Time) -> Any:
+    def _message(self, command: Command, q: np.ndarray, stamp: messages.Time) -> Any:
         """Returns `servo_jp` or `servo_cp` of a command, with the frame in its header."""
         if self.file.arm.command == "servo_jp":
-            base = self._tip_in_base(command)
-            q = psm.joints_of(base, self.file.instrument)
-            near = self._q if self.sent else self._joints()
-            self._q = min((q, psm.half_turn(q)), key=lambda x: np.abs(x - near).max())
-            names = crtk.names_of(self._newest("joints"), psm.NAMES)
             out = messages.JointState(messages.Header(stamp, self.file.arm.frame))
-            return crtk.fill_joints(out, self._q, names)
+            return crtk.fill_joints(out, q, self._names())
         base, name = self.file.pose_world_base, self._base_name
         if not name:  # the endoscope at this moment
             view = self._newest("view")
@@ -185,8 +225,10 @@ class CrtkArm:
         return self.bus.newest[self.sources[name].topic]
 
     def _joints(self) -> np.ndarray:
-        message = self._newest("joints")
-        return crtk.joints_of(message, crtk.names_of(message, psm.NAMES))
+        return crtk.joints_of(self._newest("joints"), self._names())
+
+    def _names(self) -> Any:
+        return crtk.names_of(self._newest("joints"), self.kinematics.names)
 
     def _p_world_trocar(self) -> np.ndarray:
         message = self._newest("trocar")
@@ -201,6 +243,12 @@ class CrtkArm:
 
     def _image(self, name: str) -> np.ndarray:
         message = self._newest(name)
+        if isinstance(message, messages.CompressedImage):
+            try:
+                picture = Image.open(io.BytesIO(bytes(message.data))).convert("RGB")
+            except OSError as error:
+                raise UsageError(name, "a JPEG or PNG file", str(error)) from None
+            return images.square(np.asarray(picture), self._size)
         if message.encoding not in _ENCODINGS:
             raise UsageError(name, " or ".join(_ENCODINGS), message.encoding)
         rows = np.frombuffer(bytes(message.data), np.uint8)

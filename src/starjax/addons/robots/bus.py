@@ -1,5 +1,6 @@
-"""Topics of ROS 2 over DDS: newest messages, other writers, networks. Polled, without listeners."""
+"""Topics of ROS 2 over DDS: newest messages, other writers, time. Polled, without listeners."""
 
+import functools
 import os
 import time
 from typing import Any
@@ -14,6 +15,7 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
+from starjax.addons.robots import messages
 from starjax.addons.robots.messages import ros_name
 from starjax.addons.robots.robot_file import Network
 
@@ -21,23 +23,44 @@ _BLOCKING = duration(milliseconds=20)  # wait of a reliable writer for a full re
 _DEPTHS = {"default": 10, "servo": 1, "sensor": 5, "latched": 1}
 _URI = "CYCLONEDDS_URI"  # a user's own configuration replaces ours
 _AT_ONCE = 20  # messages of a topic that a poll reads
+_CLOCK = "/clock"
+# s by which a simulator's clock may stand: a slow one is not a dead one. Then time goes on, and
+# what it has measured becomes old.
+_PATIENCE_S = 2.0
 
 
 class Bus:
     """A participant of DDS with its readers and writers.
 
     Attributes:
-      newest: topic -> the newest message. came: topic -> s, `time.time()` of its arrival.
+      newest: topic -> the newest message. came: topic -> s, `now()` at its arrival.
     """
 
     def __init__(self, network: Network) -> None:
-        self._domain = None if _URI in os.environ else Domain(network.domain, _xml(network))
+        self._domain = None if _URI in os.environ else _configured(network.domain, _xml(network))
         self._participant = DomainParticipant(network.domain)
         self._found = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         self._others: dict[Any, tuple[str, str]] = {}  # key -> topic and type of another's writer
         self._readers: dict[str, DataReader] = {}
         self.newest: dict[str, Any] = {}
         self.came: dict[str, float] = {}
+        self._is_simulated, self._ticked = network.use_sim_time, time.monotonic()
+        if self._is_simulated:
+            self.read(_CLOCK, messages.Clock, "sensor")
+
+    def now(self) -> float:
+        """Returns s of the computer's clock, or of the simulator's."""
+        if not self._is_simulated:
+            return time.time()
+        self._take(_CLOCK)
+        clock = self.newest.get(_CLOCK, messages.Clock()).clock
+        stood = time.monotonic() - self._ticked
+        return clock.sec + 1e-9 * clock.nanosec + max(0.0, stood - _PATIENCE_S)
+
+    def wait(self, until: float) -> None:
+        """Waits until `now()` is `until`."""
+        while (rest := until - self.now()) > 0.0:
+            time.sleep(min(rest, 5e-4) if self._is_simulated else rest)
 
     def read(self, topic: str, kind: type, profile: str = "default") -> None:
         """Subscribes; `poll` keeps the newest message."""
@@ -54,11 +77,8 @@ class Bus:
     def poll(self) -> list[str]:
         """Reads all topics; returns those with a new message."""
         fresh = []
-        for topic, reader in self._readers.items():
-            # A writer that ended leaves a sample without fields.
-            some = [x for x in reader.take(_AT_ONCE) if not isinstance(x, InvalidSample)]
-            if some:
-                self.newest[topic], self.came[topic] = some[-1], time.time()
+        for topic in self._readers:
+            if self._take(topic):
                 fresh.append(topic)
         for one in self._found.take(100):
             if not one.sample_info.valid_data:
@@ -66,6 +86,19 @@ class Bus:
             elif one.participant_key != self._participant.guid:
                 self._others[one.key] = (one.topic_name.removeprefix("rt"), one.type_name)
         return fresh
+
+    def _take(self, topic: str) -> bool:
+        """Keeps the newest message of a topic; returns False without a new one."""
+        # A writer that ended leaves a sample without fields.
+        taken = self._readers[topic].take(_AT_ONCE)
+        some = [one for one in taken if not isinstance(one, InvalidSample)]
+        if some:
+            self.newest[topic] = some[-1]
+            if topic == _CLOCK:
+                self._ticked = time.monotonic()
+            else:
+                self.came[topic] = self.now()
+        return bool(some)
 
     def writers(self, topic: str) -> list[str]:
         """Returns the types of other participants' writers on a topic, as ROS names them.
@@ -77,6 +110,12 @@ class Bus:
     def topics(self) -> list[str]:
         """Returns the topics of other participants' writers."""
         return sorted({where for where, _ in self._others.values()})
+
+
+@functools.cache
+def _configured(domain: int, xml: str) -> Domain:
+    """Returns the domain of this process, which has one for all its participants."""
+    return Domain(domain, xml)
 
 
 def _xml(network: Network) -> str:

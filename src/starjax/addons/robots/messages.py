@@ -28,6 +28,23 @@ class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
 
 @dataclass
 @final
+class Duration(IdlStruct, typename="builtin_interfaces::msg::dds_::Duration_"):
+    """A time between two in s and ns."""
+
+    sec: int32 = 0
+    nanosec: uint32 = 0
+
+
+@dataclass
+@final
+class Clock(IdlStruct, typename="rosgraph_msgs::msg::dds_::Clock_"):
+    """The time of a simulator."""
+
+    clock: Time = field(default_factory=Time)
+
+
+@dataclass
+@final
 class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
     """Time and frame of a message."""
 

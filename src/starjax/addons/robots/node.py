@@ -3,16 +3,16 @@
 # pyright: reportArgumentType=false
 # Sequences of messages are lists: see `messages`.
 
-import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from starjax import rcm
-from starjax.addons.robots import between, messages
+from starjax.addons.robots import between, markers, messages
 from starjax.addons.robots.arm import WORLD, CrtkArm
 from starjax.addons.robots.robot_file import RobotFile
+from starjax.core.errors import UsageError
 from starjax.core.types import Command
 from starjax.deploy import guard
 from starjax.deploy.client import Client
@@ -30,11 +30,11 @@ def tolerances(file: RobotFile, is_dry: bool = False) -> guard.Tolerances:
 
 def doubts(arm: CrtkArm, client: Client) -> list[guard.Doubt]:
     """Returns the doubts about an arm that its `Client` does not see: state, commanders, joints."""
-    now, where = time.time(), client.p_world_trocar
+    now, where = arm.bus.now(), client.p_world_trocar
     found = guard.check(arm.snapshot(now), (), where, now, tolerances(arm.file))
     if missing := arm.missing():
         found.append(guard.Doubt("arm", "topics", f"no message of {', '.join(missing)}"))
-    return [doubt for doubt in found if doubt.kind == "arm"]
+    return [doubt for doubt in found if doubt.kind == "arm"] + arm.reports()
 
 
 def run(
@@ -62,6 +62,7 @@ def run(
     Raises:
       UsageError: the arm is in doubt at the start.
     """
+    arm.forget()
     shown = Shown(arm)
     steps = max(1, round(arm.file.arm.rate / client.control_hz))
     way = between.of(client.input_spec.held_wrist, steps)
@@ -69,7 +70,7 @@ def run(
     still = Command(seen.pose, seen.gripper)
     way(still, still, client.p_world_trocar)  # compiles, as does an error
     rcm.rcm_error(seen.shaft, client.p_world_trocar)
-    period, due, last = 1.0 / arm.file.arm.rate, time.monotonic(), None
+    period, due, last = 1.0 / arm.file.arm.rate, arm.bus.now(), None
     for _ in range(round(seconds * client.control_hz)):
         arm.poll()
         if bad := doubts(arm, client):
@@ -79,49 +80,71 @@ def run(
         if first and not is_dry:
             client.stop(str(first[0]))
             command = None
+        if command is not None:
+            shown.show(command, client)
+            for one in way(last or command, command, client.p_world_trocar):
+                if not is_dry:
+                    try:
+                        arm.send(one)
+                    except UsageError as error:
+                        client.stop(f"out of reach: {error}")
+                        command = None
+                        break
+                due = max(due + period, arm.bus.now() - period)  # lost periods are not made up for
+                arm.bus.wait(due)
+        last = command
         if command is None:
-            last, reason = None, client.report.fault
-            shown.show(None, client, reason)
+            reason = client.report.fault
+            shown.show(None, client)
             if should_stop() or not confirm(reason):
                 break
+            arm.forget()
             arm.poll()
             client.restart(arm.measure())
-            due = time.monotonic()
-            continue
-        shown.show(command, client, "running")
-        for one in way(last or command, command, client.p_world_trocar):
-            if not is_dry:
-                arm.send(one)
-            due = max(due + period, time.monotonic() - period)  # lost periods are not made up for
-            time.sleep(max(due - time.monotonic(), 0.0))
-        last = command
-        if should_stop():
+            due = arm.bus.now()
+        elif should_stop():
             break
     return client.report
 
 
 class Shown:
-    """Topics for rviz and recordings: plan, trocar, RCM error, state; all in the world's frame."""
+    """Topics for rviz and recordings, in the world's frame, and texts as CRTK names them."""
 
     def __init__(self, arm: CrtkArm) -> None:
         self._arm = arm
+        text, number = messages.StringStamped, messages.Float64
         kinds: dict[str, tuple[Any, str]] = {
             "plan": (messages.Path, "default"),
+            "markers": (markers.MarkerArray, "default"),
             "trocar": (messages.PointStamped, "latched"),
-            "rcm_error": (messages.Float64, "default"),
-            "state": (messages.StringStamped, "latched"),
+            "rcm_error": (number, "default"),
+            "alarm": (text, "latched"),
+            **dict.fromkeys(("state", "warning", "error"), (text, "latched")),
         }
         self._writers = {n: arm.bus.writer(f"{AT}/{n}", *kind) for n, kind in kinds.items()}
-        self._reason = ""
+        self._texts: dict[str, str] = {}
 
-    def show(self, command: Command | None, client: Client, reason: str) -> None:
-        """Publishes the present plan and error; the state when it changes."""
-        header = messages.Header(messages.stamp(), WORLD)
-        if reason != self._reason:
-            self._reason = reason
-            self._writers["state"].write(messages.StringStamped(header, reason))
-            where = messages.Point(*map(float, client.p_world_trocar))
-            self._writers["trocar"].write(messages.PointStamped(header, where))
+    def show(self, command: Command | None, client: Client) -> None:
+        """Publishes the present plan and error, and texts that changed.
+
+        Args:
+          command: None while there is none, for the reason in the report.
+        """
+        report = client.report
+        header = messages.Header(messages.stamp(self._arm.bus.now()), WORLD)
+        view = [str(doubt) for doubt in client.doubts if doubt.kind == "view"]
+        texts = {
+            "state": report.fault if command is None else "running",
+            "error": report.fault if command is None else "",
+            "warning": "; ".join(view),
+            "alarm": report.alarm,
+        }
+        for name, text in texts.items():
+            if text != self._texts.get(name, ""):
+                self._texts[name] = text
+                self._writers[name].write(messages.StringStamped(header, text))
+                where = messages.Point(*map(float, client.p_world_trocar))
+                self._writers["trocar"].write(messages.PointStamped(header, where))
         if command is None:
             return
         path = [
@@ -129,6 +152,9 @@ class Shown:
             for p in client.plan
         ]
         self._writers["plan"].write(messages.Path(header, path))
-        shaft = self._arm.measure().shaft
-        off = float(rcm.rcm_error(shaft, client.p_world_trocar))
+        seen = self._arm.measure()
+        off = float(rcm.rcm_error(seen.shaft, client.p_world_trocar))
         self._writers["rcm_error"].write(messages.Float64(off))
+        text = texts["alarm"] or texts["warning"] or texts["state"]
+        shown = markers.of(header, client.p_world_trocar, seen.pose.p, client.plan, off, text)
+        self._writers["markers"].write(shown)

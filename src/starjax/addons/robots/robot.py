@@ -55,7 +55,9 @@ def main(argv: Sequence[str]) -> int:
     from starjax.addons.robots import bus, node, topic_table
     from starjax.deploy import in_process
 
+    own = bus.Bus(file.network)
     options_ = {
+        "clock": own.now,
         "limits": deploy.Limits(file.limits.speed, file.limits.turn_rate),
         "tolerances": node.tolerances(file, args.dry_run),
     }
@@ -71,7 +73,7 @@ def main(argv: Sequence[str]) -> int:
         cameras = sorted(file.cameras) or "none"
         fits = set(file.cameras) == set(spec.cameras)
         checks.expect(fits, f"{args.file}: camera", f"tables {list(spec.cameras)}", cameras)
-        arm = arms.CrtkArm(bus.Bus(file.network), file, spec.image_size)
+        arm = arms.CrtkArm(own, file, spec.image_size)
         rows = topic_table.look(arm, _LOOK_S, args.wait_s, should_stop)
         bad = topic_table.problems(rows) + [str(doubt) for doubt in node.doubts(arm, client)]
         print(topic_table.text(rows), *(f"- {line}" for line in bad), sep="\n", flush=True)

@@ -1,6 +1,7 @@
 """The description of a robot: a TOML file with its topics, frames, trocar and limits."""
 
 import dataclasses
+import json
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -8,12 +9,28 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from starjax.addons.robots import crtk, psm
+from starjax.addons.robots import crtk, kinematics
 from starjax.addons.robots.crtk import Jaw
+from starjax.addons.robots.kinematics import INSTRUMENTS, PSM
+from starjax.core import errors
 from starjax.core.errors import UsageError
 from starjax.core.types import Pose
 
-INSTRUMENTS = {"large_needle_driver": psm.LARGE_NEEDLE_DRIVER, "prograsp": psm.PROGRASP}
+# CRTK's names in the arm's namespace.
+TOPICS = {
+    "pose": "local/measured_cp",
+    "view": "measured_cp",
+    "setpoint": "setpoint_cp",
+    "joints": "measured_js",
+    "joint_setpoint": "setpoint_js",
+    "jaw": "jaw/measured_js",
+    "state": "operating_state",
+    "warning": "warning",
+    "error": "error",
+    "servo_cp": "servo_cp",
+    "servo_jp": "servo_jp",
+    "jaw_servo": "jaw/servo_jp",
+}
 VIEW = "view"  # the frame of commands relative to the endoscope
 
 
@@ -23,18 +40,22 @@ class ArmTable:
 
     Attributes:
       namespace: of the arm's topics, e.g. `/PSM1`.
-      command: `servo_jp`, joints by the closed kinematics of a PSM, or `servo_cp`, poses.
+      kind: `psm`, or an arm of the registry that takes joints, e.g. `fr5`.
+      command: `servo_jp`, joints by our inverse kinematics, or `servo_cp`, poses of a PSM.
       frame: name of the base frame, or `view`: `servo_cp` relative to the endoscope.
-      instrument: key of `INSTRUMENTS`.
+      instrument: of a PSM `large_needle_driver` or `prograsp`, of others a straight tool.
+      task: whose mount of another arm has the tool's turn on the flange.
       closed, open: rad, angles of the jaws.
       position, quaternion_xyzw: of the base in the policy's world, m.
       rate: Hz, of the commands; a policy has 30 Hz, in between they are interpolated.
     """
 
     namespace: str
+    kind: str = PSM
     command: str = "servo_jp"
     frame: str = "PSM1_base"
     instrument: str = "large_needle_driver"
+    task: str = "peg_transfer"
     closed: float = -0.25
     open: float = 1.0
     position: tuple[float, ...] = (0.0, 0.0, 0.15)
@@ -52,7 +73,11 @@ class TrocarTable:
 
 @dataclasses.dataclass(frozen=True)
 class CameraTable:
-    """Table `[camera.NAME]`: the topic of an Image, cropped to its middle square."""
+    """Table `[camera.NAME]`: a topic of images, cropped to their middle square.
+
+    Attributes:
+      topic: of an Image; of a CompressedImage if it ends in `/compressed`.
+    """
 
     topic: str
 
@@ -77,27 +102,33 @@ class Network:
       interface: of the computer, such as `eth0`; `lo`: this computer only, without multicast;
         empty: DDS's own choice, with multicast.
       peers: addresses of other computers, in place of multicast.
+      use_sim_time: True for a simulator's time, its topic `/clock`.
     """
 
     domain: int = 0
     interface: str = ""
     peers: tuple[str, ...] = ()
+    use_sim_time: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
 class RobotFile:
-    """A robot as its file describes it."""
+    """A robot as its file describes it.
+
+    Attributes:
+      topics: name of `TOPICS` -> topic in place of CRTK's.
+    """
 
     arm: ArmTable
     trocar: TrocarTable
     cameras: dict[str, CameraTable]
     limits: LimitsTable
     network: Network
+    topics: dict[str, str] = dataclasses.field(default_factory=dict)
 
-    @property
-    def instrument(self) -> psm.Instrument:
-        """Returns the sizes of the instrument."""
-        return INSTRUMENTS[self.arm.instrument]
+    def topic(self, name: str) -> str:
+        """Returns the topic of a name of `TOPICS`."""
+        return self.topics.get(name) or f"{self.arm.namespace}/{TOPICS[name]}"
 
     @property
     def jaw(self) -> Jaw:
@@ -126,15 +157,37 @@ def read(path: str | Path) -> RobotFile:
         tables = tomllib.loads(Path(path).read_text())
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise UsageError(str(path), "the TOML file of a robot", str(error)) from None
-    cameras = tables.pop("camera", {})
+    cameras, topics = tables.pop("camera", {}), tables.pop("topics", {})
+    for name, topic in topics.items():
+        errors.choice(f"{path}: topics.{name}", name, TOPICS)
+        if not (isinstance(topic, str) and topic.startswith("/")):
+            raise UsageError(f"{path}: topics.{name}", "a topic with a slash", repr(topic))
     kinds = {"arm": ArmTable, "trocar": TrocarTable, "limits": LimitsTable, "network": Network}
     for name in set(tables) - set(kinds):
-        raise UsageError(f"{path}: {name}", f"one of {', '.join([*kinds, 'camera'])}", "unknown")
+        raise UsageError(
+            f"{path}: {name}", f"one of {', '.join([*kinds, 'camera', 'topics'])}", "unknown"
+        )
     parts = {name: _table(path, name, kind, tables.get(name, {})) for name, kind in kinds.items()}
     made = {name: _table(path, f"camera.{name}", CameraTable, row) for name, row in cameras.items()}
-    robot = RobotFile(cameras=made, **parts)
+    robot = RobotFile(cameras=made, topics=topics, **parts)
     _check(path, robot)
     return robot
+
+
+def text(robot: RobotFile) -> str:
+    """Returns the TOML text of a robot's file."""
+    tables = {
+        name: dataclasses.asdict(getattr(robot, name))
+        for name in ("arm", "trocar", "limits", "network")
+    }
+    tables |= {f"camera.{name}": dataclasses.asdict(row) for name, row in robot.cameras.items()}
+    tables["topics"] = robot.topics
+    lines = []
+    for name, rows in tables.items():
+        lines.append(f"[{name}]")
+        # Strings, numbers, booleans and lists of numbers are alike in JSON.
+        lines += [f"{key} = {json.dumps(value)}" for key, value in rows.items()]
+    return "\n".join(lines) + "\n"
 
 
 def _table(path: Any, name: str, kind: Any, values: Any) -> Any:
@@ -145,10 +198,10 @@ def _table(path: Any, name: str, kind: Any, values: Any) -> Any:
     for key, value in values.items():
         if key not in fields:
             raise UsageError(f"{path}: {name}.{key}", f"one of {', '.join(fields)}", "unknown")
-        expected = {str: "text", int: "a whole number", float: "a number"}
+        expected = {bool: "true or false", str: "text", int: "a whole number", float: "a number"}
         kinds: Any = (int, float) if fields[key].type is float else fields[key].type
         if fields[key].type in expected and (
-            not isinstance(value, kinds) or isinstance(value, bool)
+            not isinstance(value, kinds) or isinstance(value, bool) is not (kinds is bool)
         ):
             raise UsageError(f"{path}: {name}.{key}", expected[fields[key].type], repr(value))
         if fields[key].type not in expected and not isinstance(value, list):
@@ -160,16 +213,23 @@ def _table(path: Any, name: str, kind: Any, values: Any) -> Any:
 
 
 def _check(path: Any, robot: RobotFile) -> None:
+    from starjax.sim import registries
+
     arm, place = robot.arm, robot.trocar.position
+    is_psm, kinds = arm.kind == PSM, kinematics.kinds()
+    instruments = list(INSTRUMENTS) if is_psm else registries.tools.names()
     rows = [
         ("arm.command", arm.command in ("servo_jp", "servo_cp"), "servo_jp or servo_cp"),
         ("arm.frame", bool(arm.frame), "the name of a frame, or view"),
-        ("arm.instrument", arm.instrument in INSTRUMENTS, ", ".join(INSTRUMENTS)),
+        ("arm.kind", arm.kind in kinds, ", ".join(kinds)),
+        ("arm.command", is_psm or arm.command == "servo_jp", f"servo_jp of {arm.kind}"),
+        ("arm.instrument", arm.instrument in instruments, ", ".join(instruments)),
+        ("arm.task", arm.task in registries.tasks.names(), ", ".join(registries.tasks.names())),
         ("arm.position", _is_point(arm.position), "x, y, z in m"),
         ("arm.quaternion_xyzw", _is_unit(arm.quaternion_xyzw), "x, y, z, w of length 1"),
         ("arm.open", arm.open > arm.closed, "more than arm.closed, rad"),
         ("arm.rate", 30.0 <= arm.rate <= 500.0, "30 to 500 Hz"),
-        ("trocar.position", not place or _is_point(place), "x, y, z in m"),
+        ("trocar.position", _is_point(place) if place else is_psm, "x, y, z in m"),
     ]
     rows += [
         (f"limits.{name}", 0.0 < value < np.inf, "more than 0")

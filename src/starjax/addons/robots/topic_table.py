@@ -42,7 +42,7 @@ def look(
         for name, source in arm.sources.items():
             counts[name] += source.topic in fresh
         time.sleep(0.002)
-    now, missing = time.time(), arm.missing()
+    now, missing = arm.bus.now(), arm.missing()
     rows = [
         TopicRow(
             source.topic,
