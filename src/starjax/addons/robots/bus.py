@@ -24,8 +24,8 @@ _DEPTHS = {"default": 10, "servo": 1, "sensor": 5, "latched": 1}
 _URI = "CYCLONEDDS_URI"  # a user's own configuration replaces ours
 _AT_ONCE = 20  # messages of a topic that a poll reads
 _CLOCK = "/clock"
-# s by which a simulator's clock may stand: a slow one is not a dead one. Then time goes on, and
-# what it has measured becomes old.
+# s for which a simulator's clock may stand, as a slow one does. Then time goes on, so measurements
+# of a dead one become old.
 _PATIENCE_S = 2.0
 
 
