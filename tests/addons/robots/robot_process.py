@@ -16,7 +16,7 @@ import numpy as np
 
 from starjax.addons.robots import bus, kinematics, messages, robot_file, sim_arm
 
-PATIENCE_S = 0.05  # of the clock, for a node that commands
+PATIENCE_S = 0.05  # the clock waits for a node that commands
 
 
 def on_shaft(kin: kinematics.Kinematics) -> np.ndarray:

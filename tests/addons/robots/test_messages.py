@@ -25,7 +25,7 @@ FILLED = [
     m.CompressedImage(HEADER, "jpeg", b"\xff\xd8"),
     m.OperatingState(HEADER, "ENABLED", True, False),
     m.StringStamped(HEADER, "fault"),
-    m.Clock(m.Time(5, 6)),
+    m.ClockMessage(m.Time(5, 6)),
     markers.of(HEADER, np.zeros(3), np.ones(3), np.ones((4, 3)), 0.002, "running"),
 ]
 CRTK = {

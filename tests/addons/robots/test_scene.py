@@ -14,7 +14,7 @@ pytest.importorskip("cyclonedds")
 from starjax.addons.robots import bus, robot_file, scene_body, sim_arm, sim_robot
 
 DOMAIN = 100 - int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:])
-# Arm, instrument, task, policy, camera: as in the policies' training, but for their topics.
+# Arm, instrument, task, policy and camera, as in the policies' training.
 TASKS = [
     ("fr5", "grasper", "peg_transfer", "compact", "camera"),
     ("psm", "large_needle_driver", "needle_drive", "needle_drive", "camera_near"),

@@ -24,8 +24,8 @@ _DEPTHS = {"default": 10, "servo": 1, "sensor": 5, "latched": 1}
 _URI = "CYCLONEDDS_URI"  # a user's own configuration replaces ours
 _AT_ONCE = 20  # messages of a topic that a poll reads
 _CLOCK = "/clock"
-# s for which a simulator's clock may stand, as a slow one does. Then time goes on, so measurements
-# of a dead one become old.
+# s for which a simulator's clock may stand, as a slow one does. Then it follows the computer's, so
+# a dead one's measurements become old.
 _PATIENCE_S = 2.0
 
 
@@ -46,14 +46,14 @@ class Bus:
         self.came: dict[str, float] = {}
         self._is_simulated, self._ticked = network.use_sim_time, time.monotonic()
         if self._is_simulated:
-            self.read(_CLOCK, messages.Clock, "sensor")
+            self.read(_CLOCK, messages.ClockMessage, "sensor")
 
     def now(self) -> float:
         """Returns s of the computer's clock, or of the simulator's."""
         if not self._is_simulated:
             return time.time()
         self._take(_CLOCK)
-        clock = self.newest.get(_CLOCK, messages.Clock()).clock
+        clock = self.newest.get(_CLOCK, messages.ClockMessage()).clock
         stood = time.monotonic() - self._ticked
         return clock.sec + 1e-9 * clock.nanosec + max(0.0, stood - _PATIENCE_S)
 

@@ -37,7 +37,7 @@ class Duration(IdlStruct, typename="builtin_interfaces::msg::dds_::Duration_"):
 
 @dataclass
 @final
-class Clock(IdlStruct, typename="rosgraph_msgs::msg::dds_::Clock_"):
+class ClockMessage(IdlStruct, typename="rosgraph_msgs::msg::dds_::Clock_"):
     """The time of a simulator."""
 
     clock: Time = field(default_factory=Time)

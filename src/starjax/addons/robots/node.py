@@ -128,7 +128,7 @@ class Shown:
         """Publishes the present plan and error, and texts that changed.
 
         Args:
-          command: None while there is none, for the reason in the report.
+          command: None at a stop; the report has its reason.
         """
         report = client.report
         header = messages.Header(messages.stamp(self._arm.bus.now()), WORLD)

@@ -13,11 +13,11 @@ from starjax.rcm.trocar import Trocar
 from starjax.runtime.precompile import Program
 from starjax.sim import env as sim_env
 
-PERIODS = round(sim_arm.RATE / sim_env.CONTROL_HZ)  # of the topics in a control period
+PERIODS = round(sim_arm.RATE / sim_env.CONTROL_HZ)  # topics' periods in a control period
 
 
 class SceneBody:
-    """A `sim_arm.Body`: a control period takes the goal at its start; its joints are interpolated.
+    """A `sim_arm.ArmBody`: a control period takes the goal at its start; its joints are interpolated.
 
     Attributes:
       env: environment of one arm. state: EnvState of the episode.
@@ -107,7 +107,7 @@ class SceneBody:
         return np.asarray(self.state.physics.qpos[self._bound.q], np.float64)
 
     def _advanced(self, state: Any, command: Command) -> Any:
-        """The scene goes on after its success, as a laboratory does."""
+        """Steps a scene that a success does not end."""
         going = state.replace(done=jnp.zeros((), bool))
         after = self.env.step(going, command)
         return after, self._seen(after)

@@ -38,7 +38,7 @@ def frame_of(namespace: str) -> str:
     return f"{namespace.strip('/')}_base"
 
 
-class Body(Protocol):
+class ArmBody(Protocol):
     """The moving part of a simulated arm.
 
     Attributes:
@@ -66,7 +66,7 @@ class Body(Protocol):
 
 
 class Kinematic:
-    """A `Body` that approaches its goal at bounded speeds and touches nothing."""
+    """An `ArmBody` that approaches its goal at bounded speeds and touches nothing."""
 
     def __init__(
         self, kinematics: Kinematics, picture: np.ndarray, q: np.ndarray | None = None
@@ -107,7 +107,7 @@ class SimArm:
     """
 
     def __init__(
-        self, bus: Bus, body: Body, namespace: str = "/PSM1", is_clocked: bool = False
+        self, bus: Bus, body: ArmBody, namespace: str = "/PSM1", is_clocked: bool = False
     ) -> None:
         self.body, self.goal, self.jaw = body, body.q.copy(), body.gripper
         self.state, self.p_trocar, self.is_frozen = "ENABLED", body.p_base_trocar, False
@@ -126,7 +126,7 @@ class SimArm:
             "operating_state": (messages.OperatingState, "latched"),
         }
         self._writers = {n: bus.writer(f"{namespace}/{n}", *kind) for n, kind in kinds.items()}
-        self._clock = bus.writer("/clock", messages.Clock, "sensor") if is_clocked else None
+        self._clock = bus.writer("/clock", messages.ClockMessage, "sensor") if is_clocked else None
         self._cameras: dict[str, Any] = {}
         self._trocar = bus.writer("/trocar", messages.PointStamped, "latched")
         for name, kind in (("servo_cp", pose), ("servo_jp", joints), ("jaw/servo_jp", joints)):
@@ -221,7 +221,7 @@ class SimArm:
             message = messages.Image(header, height, width, "rgb8", 0, 3 * width, data)
             self._cameras[topic].write(message)
         if self._clock is not None:
-            self._clock.write(messages.Clock(messages.stamp(self.clock)))
+            self._clock.write(messages.ClockMessage(messages.stamp(self.clock)))
 
     def _tool(self, q: np.ndarray) -> Pose:
         return crtk.compose(self.body.kinematics.tip_of(q), crtk.inverse(self._tip))

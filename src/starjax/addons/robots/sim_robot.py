@@ -31,7 +31,7 @@ class SimRobotArgs:
     camera: tuple[str, ...] = ()  # cameras of the task; none for its first one
     image_size: Annotated[int, Range(16, 1080)] = 128  # pixels per side
     trocar: Annotated[int, Range(0, 10**6)] = 0  # index of the task's trocars
-    seed: Annotated[int, Range(0, 10**6)] = 0  # of the objects' places
+    seed: Annotated[int, Range(0, 10**6)] = 0  # random seed, places the objects
     file: str = ""  # write the file for `starjax robot` here
     domain: Annotated[int, Range(0, 232)] = 0  # ROS_DOMAIN_ID
     interface: str = "lo"  # network interface; empty: DDS's choice, with multicast
