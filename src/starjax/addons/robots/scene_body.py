@@ -17,7 +17,8 @@ PERIODS = round(sim_arm.RATE / sim_env.CONTROL_HZ)  # topics' periods in a contr
 
 
 class SceneBody:
-    """A `sim_arm.ArmBody`: a control period takes the goal at its start; its joints are interpolated.
+    """An `ArmBody` in a scene: control periods take the goal at their start, joints in between are
+    interpolated.
 
     Attributes:
       env: environment of one arm. state: EnvState of the episode.
@@ -107,7 +108,7 @@ class SceneBody:
         return np.asarray(self.state.physics.qpos[self._bound.q], np.float64)
 
     def _advanced(self, state: Any, command: Command) -> Any:
-        """Steps a scene that a success does not end."""
+        """Computes a control period, also after a success, and the images."""
         going = state.replace(done=jnp.zeros((), bool))
         after = self.env.step(going, command)
         return after, self._seen(after)
