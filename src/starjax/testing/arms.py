@@ -24,7 +24,10 @@ def check(name: str, n: int) -> Iterator[Check]:
         yield fault
         return
     text = f"{len(arm.joints)} joints with servos, flange"
-    record = verdict("record", [*not_finite(arm), *outside(arm, RANGES, "")], text)
+    faults = [*not_finite(arm), *outside(arm, RANGES, "")]
+    if arm.watched not in range(len(arm.joints)):
+        faults.append(f"watched: expected the index of a joint, got {arm.watched}")
+    record = verdict("record", faults, text)
     yield record
     if record.status == FAILED:
         return
