@@ -28,7 +28,7 @@ SIZES = {
 }
 STEPS = 100  # steps of a short training
 LEARNING_RATE = 1e-3
-TARGET = 0.5  # of every number of the learned sequences, of either sign: the condition says which
+TARGET = 0.5  # every number of a learned sequence, of either sign: the condition says which
 NEARER = 0.02  # fraction of the mean action's error by which the samples' must be smaller
 SEEN = 1e-6  # least change of a sample
 TOLERANCE = 1e-4  # between a sample in one batch and in another
