@@ -25,4 +25,4 @@ def nearly_lost(state: EnvState) -> jax.Array:
     return state.measurements.missed > NEARLY * task.MAY_MISS
 
 
-RESCUER = Rescuer(resume, expert.AGENT.act, nearly_lost)
+RESCUER = Rescuer(resume, expert.AGENT.act, nearly_lost, version=2)

@@ -51,4 +51,4 @@ def _is_up(state: EnvState) -> jax.Array:
     return state.measurements.needle.p[2] > state.layout.needle.p[2] + single.LIFT
 
 
-RESCUER = Rescuer(resume, expert.AGENT.act, nearly_lost)
+RESCUER = Rescuer(resume, expert.AGENT.act, nearly_lost, version=2)

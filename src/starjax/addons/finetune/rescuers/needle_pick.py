@@ -95,4 +95,4 @@ _GRASP = expert.GRASP._replace(
     following=_following,
     enter=_enter,
 )
-RESCUER = Rescuer(resume, phases.agent(expert.init, _GRASP).act)
+RESCUER = Rescuer(resume, phases.agent(expert.init, _GRASP).act, version=2)

@@ -69,7 +69,7 @@ def rescuer(middle: float = 0.0) -> Rescuer:
         phase = jnp.where(lets_go, expert.OPEN, phase).astype(jnp.int32)
         return midway.enter(expert._enter, expert.GRASP, script, phase, state)
 
-    return Rescuer(resume, expert.AGENT.act)
+    return Rescuer(resume, expert.AGENT.act, version=2)
 
 
 def _way_in(state: EnvState) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:

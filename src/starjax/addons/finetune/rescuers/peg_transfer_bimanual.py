@@ -81,4 +81,4 @@ def _is_up(state: EnvState) -> jax.Array:
     return state.measurements.block.p[2] > single.RIM_HEIGHT + single.LIFTED
 
 
-RESCUER = Rescuer(resume, handover.agent(PLAY).act, nearly_lost)
+RESCUER = Rescuer(resume, handover.agent(PLAY).act, nearly_lost, version=2)

@@ -40,4 +40,4 @@ def act(script: TurningScript, state: EnvState) -> tuple[Command, TurningScript,
     return rough, script.replace(reach=reach), label
 
 
-RESCUER = Rescuer(resume, act)
+RESCUER = Rescuer(resume, act, version=2)

@@ -35,4 +35,4 @@ def nearly_lost(state: EnvState) -> jax.Array:
     return state.measurements.rubbed > NEARLY * task.MAY_TOUCH
 
 
-RESCUER = Rescuer(resume, expert.AGENT.act, nearly_lost)
+RESCUER = Rescuer(resume, expert.AGENT.act, nearly_lost, version=2)

@@ -32,7 +32,7 @@ def make(size: Needle, agent: Agent, plane: expert.Plane = expert.vertical) -> R
         script = script.replace(attempt=jnp.zeros((), jnp.int32))
         return expert.enter(size, script, phase.astype(jnp.int32), state, plane)
 
-    return Rescuer(resume, agent.act)
+    return Rescuer(resume, agent.act, version=2)
 
 
 RESCUER = make(needles.CT1, expert.AGENT)

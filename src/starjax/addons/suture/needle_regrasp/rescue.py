@@ -46,4 +46,4 @@ def act(script: WristScript, state: EnvState) -> tuple[Command, Any, Command]:
     return expert.AGENT.act(script, state)
 
 
-RESCUER = Rescuer(resume, act)
+RESCUER = Rescuer(resume, act, version=2)

@@ -53,4 +53,4 @@ def resume(key: jax.Array, state: EnvState) -> expert.ThrowScript:
     return expert.enter(script, phase, state)
 
 
-RESCUER = Rescuer(resume, expert.AGENT.act)
+RESCUER = Rescuer(resume, expert.AGENT.act, version=2)
