@@ -5,7 +5,7 @@ comma := ,
 # jax for CUDA on a machine with NVIDIA's driver.
 CUDA := $(if $(shell command -v nvidia-smi),$(comma)cuda)
 
-.PHONY: see run test quick lint docs
+.PHONY: see run test quick release lint docs
 .DEFAULT_GOAL := run
 
 see: .venv/run.stamp
@@ -19,6 +19,9 @@ test: .venv/dev.stamp
 
 quick: .venv/dev.stamp
 	$(BIN)/pytest -m "not slow" -n 2 --dist loadfile
+
+release: .venv/dev.stamp
+	$(BIN)/pytest -m release -n 2 --dist loadfile
 
 lint: .venv/dev.stamp
 	$(BIN)/ruff check .

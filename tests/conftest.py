@@ -34,12 +34,13 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests that start a process are slow; files with a slow test come first.
+    """Tests of a release or that start a process are slow; files with a slow test come first.
 
     So no worker ends alone with one of them.
     """
     for item in items:
-        if isinstance(item, pytest.Function) and starts_process(item):
+        is_function = isinstance(item, pytest.Function)
+        if item.get_closest_marker("release") or is_function and starts_process(item):
             item.add_marker("slow")
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in slow)

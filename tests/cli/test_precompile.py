@@ -83,6 +83,7 @@ def test_an_error_ends_no_run(monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.release
 def test_it_counts_for_no_stage(tmp_path):
     program = programs.Program(lambda x: x * 3.25)
     with stage_times.timed(tmp_path, "collect"):
@@ -90,6 +91,7 @@ def test_it_counts_for_no_stage(tmp_path):
     assert stage_times.read(tmp_path)["collect: compile"] == 0.0
 
 
+@pytest.mark.release
 def test_features_and_steps_are_compiled_before_the_demonstrations_exist(tmp_path, monkeypatch):
     env = stubs.make_env("image", unlucky=0.0)
     env = env._replace(camera=larger(env.camera), draw=larger(env.draw))

@@ -80,6 +80,7 @@ def test_cameras_that_may_move_draw_the_recorded_images_where_they_are(scene, re
         assert np.mean(np.abs(np.asarray(moved[name]).astype(int) - image)) > 1.0
 
 
+@pytest.mark.release
 def test_a_dataset_without_images_trains_at_any_size(scene, unrecorded):
     root = unrecorded
     assert not any("image" in name for name in store.read_description(root)["features"])
@@ -91,6 +92,7 @@ def test_a_dataset_without_images_trains_at_any_size(scene, unrecorded):
         assert np.asarray(images[np.array([3, 7])]).std() > 5
 
 
+@pytest.mark.release
 def test_images_of_moments_are_the_recorded_ones_or_drawn_at_any_size(scene, recorded, unrecorded):
     key, camera = store.keys(recorded)[0], scene.names.cameras[0]
     seen = episode_images.of_episode(recorded, key, [0, 9], 8)

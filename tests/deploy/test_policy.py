@@ -124,6 +124,7 @@ def test_it_decides_as_the_policy_of_an_evaluation_does(made):
 
 
 @pytest.mark.slow
+@pytest.mark.release
 def test_it_decides_alike_whatever_a_program_makes_jax_refuse(made):
     path, trained, _ = made
     arguments = jax.random.key(7), observed(trained.policy, ()), PORT

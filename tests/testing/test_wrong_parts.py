@@ -330,6 +330,7 @@ def test_a_disturbance_that_makes_episodes_succeed():
 
 
 @pytest.mark.slow
+@pytest.mark.release
 def test_a_disturbance_that_sets_success():
     def on_step(env, disturbance, state, command):
         after = env.step(state, command)

@@ -30,6 +30,7 @@ def test_the_teacher_is_the_same_network_sampled_as_a_flow():
 
 
 @pytest.mark.slow
+@pytest.mark.release
 def test_the_student_comes_nearer_to_its_flow():
     row = methods.METHODS["dp_rcm4"]
     policy, flow = (

@@ -130,6 +130,7 @@ def outcome():
 
 
 @pytest.mark.slow
+@pytest.mark.release
 def test_a_policy_that_stops_short_learns_to_arrive(file, monkeypatch):
     assert tune() == 0
     out = Path("tuned")

@@ -124,6 +124,7 @@ def _trained_aside(key):
 
 
 @pytest.mark.slow
+@pytest.mark.release
 def test_a_network_whose_plans_end_aside_learns_to_arrive(demonstrations):
     def aims(params, stats, keys, observation, trocar):
         own = 0.005 * jax.vmap(lambda key: jax.random.normal(key, (8, 3)))(keys)
@@ -171,6 +172,7 @@ def test_an_experience_is_what_happened(demonstrations):
 
 
 @pytest.mark.slow
+@pytest.mark.release
 def test_commands_stay_on_the_manifold_at_every_step_of_learning(demonstrations):
     settings = dataclasses.replace(
         fakes.TINY,

@@ -45,6 +45,7 @@ def test_a_trajectory_is_rendered_state_by_state():
 
 
 @pytest.mark.slow
+@pytest.mark.release
 def test_a_proportional_controller_reaches_and_rests(env):
     def towards(state):
         goal = state.data.pose._replace(p=state.data.layout.p[None])

@@ -14,6 +14,7 @@ def quick(monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.release
 def test_a_search_finds_a_mount_from_its_seed_alone(quick):
     at = mounts.bench(registries.arms.get("rcm4"), registries.tools.get("grasper"))
     workspace = registries.workspaces.get("board")

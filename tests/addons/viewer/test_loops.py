@@ -175,6 +175,7 @@ def directed(steered, trocar):
     )
 
 
+@pytest.mark.release
 def test_a_person_demonstrates_and_keeps_it(page, steered, hurried, tmp_path):
     trocar, root = 3, tmp_path / "demos"
     with recorder.record_into(root, steered.env, SEED) as kept:
@@ -229,6 +230,7 @@ def test_what_was_discarded_is_nowhere(page, steered, hurried, tmp_path):
     assert len(list(root.glob("episodes/*"))) <= 1  # motion after it
 
 
+@pytest.mark.release
 def test_a_policy_goes_from_trial_to_trial_until_a_hand_relieves_it(
     page, env, hurried, tmp_path, monkeypatch
 ):
@@ -254,6 +256,7 @@ def test_a_policy_goes_from_trial_to_trial_until_a_hand_relieves_it(
     assert begun == [*range(watched[0] + 1), watched[0], watched[0] + 1] and watched[0] >= 2
 
 
+@pytest.mark.release
 def test_in_the_view_too_a_hand_relieves_the_policy_where_it_is(page, env, hurried, tmp_path):
     root, seen = tmp_path / "relief", {}
     policy = recorder.Relieved(agent.from_single(env.task.expert()), None, "digest", 2, 4)
@@ -283,6 +286,7 @@ def test_in_the_view_too_a_hand_relieves_the_policy_where_it_is(page, env, hurri
     assert record["source"] == "intervention" and (record["trocar"], record["trial"]) == (3, 0)
 
 
+@pytest.mark.release
 def test_trials_without_a_hand_follow_one_another_in_a_recorded_view(page, env, hurried, tmp_path):
     policy = recorder.Relieved(agent.from_single(env.task.expert()), None, "digest", 2, 4)
     begun = []

@@ -94,6 +94,7 @@ def test_a_full_disk_loses_no_episode(steered, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.release
 def test_recorded_episodes_are_shown_as_they_were(root):
     dataset = browse.open_dataset(root)
     shown = browse.read(dataset, dataset.keys[0])

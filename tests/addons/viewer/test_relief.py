@@ -64,6 +64,7 @@ def root(relieved, tmp_path_factory):
 
 
 @pytest.mark.slow
+@pytest.mark.release
 def test_the_hands_part_is_an_intervention(root, relieved):
     (record,) = (store.verify(root, key) for key in store.keys(root))
     assert record["source"] == "intervention" and record["policy"] == "digest"

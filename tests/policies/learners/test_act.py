@@ -63,6 +63,7 @@ def test_attention_is_the_softmax_of_products():
 
 
 @pytest.mark.slow
+@pytest.mark.release
 def test_samples_are_what_was_learned():
     params, wanted = repeats.learned(SMALL)
     found = repeats.sampled(SMALL, params)

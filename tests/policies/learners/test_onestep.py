@@ -75,6 +75,7 @@ def test_a_sample_is_within_reach():
 
 
 @pytest.mark.slow
+@pytest.mark.release
 def test_samples_are_what_was_learned():
     settings = config.with_learner(fakes.TINY, "onestep")
     params, wanted = repeats.learned(settings)

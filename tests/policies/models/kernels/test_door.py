@@ -58,8 +58,8 @@ WORK = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("part", kernels.VARIANTS)
+@pytest.mark.release
 def test_without_a_variant_the_reference_gives_the_same(part, monkeypatch):
     module = importlib.import_module(
         f"starjax.policies.models.kernels.{kernels.VARIANTS[part].split(':')[0]}"
