@@ -40,7 +40,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
     for item in items:
         is_function = isinstance(item, pytest.Function)
-        if item.get_closest_marker("release") or is_function and starts_process(item):
+        if item.get_closest_marker("release") or (is_function and starts_process(item)):
             item.add_marker("slow")
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in slow)

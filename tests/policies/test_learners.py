@@ -152,7 +152,7 @@ def test_no_learner_calls_an_option_as_policies_call_a_setting():
 def test_settings_import_no_jax():
     program = """
 import sys
-from starjax import config, learners
+from starjax.core import config, learners
 from starjax.cli import run_settings
 config.PolicyConfig()
 run_settings.parse("run", ["--preset", "cpu", "--out", "x"], "")
