@@ -78,7 +78,7 @@ def test_without_a_variant_the_reference_gives_the_same(part, monkeypatch):
 
 def test_every_file_is_named_by_one_line_and_nowhere_else(pytestconfig):
     source = pytestconfig.rootpath / "src/starjax"
-    files = {path.stem for path in (source / "models/kernels").glob("*.py")} - {"__init__"}
+    files = {path.stem for path in (source / "policies/models/kernels").glob("*.py")} - {"__init__"}
     assert sorted(line.split(":")[0] for line in kernels.VARIANTS.values()) == sorted(files)
     others = [path for path in source.rglob("*.py") if path.parent.name != "kernels"]
     texts = {path: path.read_text() for path in others}
