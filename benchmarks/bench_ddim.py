@@ -22,13 +22,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import runtime
+from starjax.addons.decisions import parallel_ddim
 from starjax.core import config, methods
 from starjax.core.types import Command
 from starjax.data import load, windows
 from starjax.policies import packaged, policy_file
 from starjax.policies import policy as policies
 from starjax.policies.models import diffusion
-from starjax.policies.models.kernels import parallel_ddim
 from starjax.sim import registries
 
 FRAMES = 128

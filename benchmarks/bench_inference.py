@@ -21,13 +21,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm, runtime
+from starjax.addons.decisions import parallel_ddim
 from starjax.cli import bench
 from starjax.core import config
 from starjax.evaluation import latency
 from starjax.policies import features
 from starjax.policies import policy as policies
 from starjax.policies.models import roll_net
-from starjax.policies.models.kernels import parallel_ddim
 
 CHAIN = 100  # roll networks in one program, each fed by the one before
 SEEN = features.select_sensors(_setup.TASK)

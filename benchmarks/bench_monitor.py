@@ -16,7 +16,7 @@ from starjax.core import methods
 from starjax.evaluation import latency
 from starjax.policies import features, in_env, packaged
 from starjax.policies import policy as policies
-from starjax.policies.monitor import calibrate, scores, watch
+from starjax.policies.monitor import record, scores, watch
 from starjax.sim import registries
 
 UPDATES = 150  # of an episode, 40 s
@@ -52,7 +52,7 @@ def update_s(execute: int, arms: int) -> float:
     tips, openings = rng.normal(size=(UPDATES, arms, 3)), rng.uniform(-1, 1, (UPDATES, arms))
     whole = [np.zeros(len(scores.NAMES)), np.ones(len(scores.NAMES))]
     settings = scores.ScoreSettings(execute, 30.0, STILL)
-    live = watch.Watch(calibrate.Monitor(*whole, np.inf, 1.0, 0.05, 100, settings, ""))
+    live = watch.Watch(record.Monitor(*whole, np.inf, 1.0, 0.05, 100, settings, ""))
     seconds = []
     for plan, tip, opening in zip(plans, tips, openings):
         start = time.perf_counter()

@@ -18,9 +18,10 @@ from typing import Any, NamedTuple
 import monitors
 import numpy as np
 
+from starjax.addons.finetune import calibration
 from starjax.evaluation import alarms
 from starjax.policies import packaged, policy_file
-from starjax.policies.monitor import calibrate, scores
+from starjax.policies.monitor import record, scores
 from starjax.runtime import files
 
 EARLY, FALSE = 0.9, 0.1  # goals: failures announced before the clock, false alarms
@@ -46,14 +47,14 @@ class Attempt(NamedTuple):
 
     names: tuple[str, ...] = scores.CALIBRATED
     change: Callable[[np.ndarray, scores.ScoreSettings], np.ndarray] = lambda values, _: values
-    calibrated: Callable[..., calibrate.Monitor] = monitors.calibrated
+    calibrated: Callable[..., record.Monitor] = monitors.calibrated
 
 
 class Chosen(NamedTuple):
     """A monitor, with the trials that it scores."""
 
     trials: monitors.Trials
-    monitor: calibrate.Monitor
+    monitor: record.Monitor
 
 
 def main(policy: str, file: str) -> None:
@@ -115,7 +116,7 @@ def halved(labels: Mapping[str, Any], *, is_test: bool) -> dict[str, Any]:
     return halves
 
 
-def pairs(labels: Mapping[str, Any], monitor: calibrate.Monitor) -> dict[str, Any]:
+def pairs(labels: Mapping[str, Any], monitor: record.Monitor) -> dict[str, Any]:
     """Counts the disturbances under which the goals are met, and by how much they are missed."""
     counts = {"pairs": 0, "early": 0, "false": 0, "both": 0, "short": 0.0}
     for label, table in labels.items():
@@ -155,16 +156,16 @@ def by_score(
     settings: scores.ScoreSettings,
     digest: str,
     names: tuple[str, ...],
-) -> calibrate.Monitor:
+) -> record.Monitor:
     """Calibrates each score alone at its part of alpha (Bonferroni), without a common scale."""
     monitor = monitors.calibrated(table, alpha, settings, digest, names)
-    fits, calibrates, _ = calibrate.parts(len(table.success))
+    fits, calibrates, _ = calibration.parts(len(table.success))
     values = table.scores[table.success & (fits | calibrates)]
     limits = np.full(len(scores.NAMES), np.nan)
     for name in names:
         i = scores.NAMES.index(name)
-        largest = calibrate.maxima(values[..., i : i + 1], np.zeros(1), np.ones(1))
-        limits[i] = calibrate.threshold(largest, alpha / len(names))
+        largest = calibration.maxima(values[..., i : i + 1], np.zeros(1), np.ones(1))
+        limits[i] = calibration.threshold(largest, alpha / len(names))
     return monitor._replace(center=limits - 1.0, width=np.ones(len(limits)), threshold=1.0)
 
 

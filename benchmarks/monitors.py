@@ -23,9 +23,10 @@ from typing import Any, NamedTuple
 import _timing
 import numpy as np
 
+from starjax.addons.finetune import calibration
 from starjax.evaluation import alarms, statistics
 from starjax.policies import packaged, policy_file
-from starjax.policies.monitor import calibrate, scores
+from starjax.policies.monitor import record, scores
 from starjax.runtime import files
 from starjax.sim.task import CONTROL_HZ
 from starjax.tasks.peg_transfer_bimanual.task import DROPPED_STEPS
@@ -42,7 +43,7 @@ def silent(policy: str, still_s: str, out: str) -> None:
     trained = policy_file.load(packaged.find("policy", policy))
     execute = trained.policy.execute
     still = max(1, round(float(still_s) * CONTROL_HZ / execute))
-    monitor = calibrate.Monitor(
+    monitor = record.Monitor(
         center=np.zeros(len(scores.NAMES)),
         width=np.ones(len(scores.NAMES)),
         threshold=_NEVER,
@@ -100,7 +101,7 @@ def read(arrays: dict[str, np.ndarray], windows: int) -> Trials:
     settings = scores.ScoreSettings(**made["monitor"]["settings"])
     settings = settings._replace(still=settings.still * windows)
     whole = evaluation(arrays, "trials", windows)
-    labels = {TESTED: select(whole, calibrate.parts(len(whole.success))[2])}
+    labels = {TESTED: select(whole, calibration.parts(len(whole.success))[2])}
     if "0/success" in arrays:
         labels[UNDISTURBED] = evaluation(arrays, "0", windows)
     for name, kind in stress["disturbances"].items():
@@ -115,8 +116,8 @@ def write(
     policy: str,
     arrays: dict[str, np.ndarray],
     labels: dict[str, Any],
-    monitor: calibrate.Monitor,
-    strict: calibrate.Monitor,
+    monitor: record.Monitor,
+    strict: record.Monitor,
     **more: Any,
 ) -> None:
     """Writes results/monitor_<POLICY>_gpu.json: both monitors, figures of the tables, and more."""
@@ -127,8 +128,8 @@ def write(
         "weights": made["weights"],
         "commands": list(dict.fromkeys([made["command"], stress["command"]])),
         **{name: made[name] for name in kept},
-        "monitor": calibrate.to_json(monitor),
-        "strict": calibrate.to_json(strict),
+        "monitor": record.to_json(monitor),
+        "strict": record.to_json(strict),
         **more,
         "rows": {label: figures(table, monitor, strict) for label, table in labels.items()},
     }
@@ -137,16 +138,16 @@ def write(
 
 def calibrated(
     table: Any, alpha: float, settings: scores.ScoreSettings, digest: str, names: Sequence[str]
-) -> calibrate.Monitor:
+) -> record.Monitor:
     """Calibrates a monitor with the successes of a table, as `starjax calibrate` does."""
-    fits, calibrates, _ = calibrate.parts(len(table.success))
+    fits, calibrates, _ = calibration.parts(len(table.success))
     parts = [table.scores[table.success & part] for part in (fits, calibrates)]
-    return calibrate.calibrate(*parts, alpha, settings, digest, names)
+    return calibration.calibrate(*parts, alpha, settings, digest, names)
 
 
-def figures(table: Any, monitor: calibrate.Monitor, strict: calibrate.Monitor) -> dict[str, Any]:
+def figures(table: Any, monitor: record.Monitor, strict: record.Monitor) -> dict[str, Any]:
     """Returns success, alarms, and the times of alarms on failures, null without one."""
-    times, _ = calibrate.first_alarms(monitor, table.scores)
+    times, _ = record.first_alarms(monitor, table.scores)
     raised = [round(float(x), 2) if np.isfinite(x) else None for x in times[~table.success]]
     # A trial is lost some control steps after the object left the last tool.
     drop_s = (table.steps - DROPPED_STEPS) / CONTROL_HZ

@@ -1,20 +1,20 @@
-"""Commands that score or calibrate trained weights. The simulator is a stub."""
+"""Commands that score trained weights. The simulator is a stub."""
 
 import dataclasses
 import json
 import types
 
 import fakes
-import jax.numpy as jnp
 import mistakes
 import numpy as np
+import one_policy
 import pytest
 import safetensors.numpy
 import stubs
+from one_policy import POLICY, unused
 
 from starjax import rcm
 from starjax.cli import (
-    calibrate,
     evaluate,
     folders,
     policy_args,
@@ -24,47 +24,16 @@ from starjax.cli import (
     sweep,
 )
 from starjax.core import config, config_json
-from starjax.data import normalizer
 from starjax.evaluation import sweep as sweeping
 from starjax.policies import in_env, packaged, policy_file
 from starjax.policies.base import Policy
-from starjax.policies.monitor import scores
 from starjax.report import video
 from starjax.runtime import files, gpu
-
-POLICY = dataclasses.replace(fakes.TINY, execute=4)
-
-
-def _unused(*_):
-    pytest.fail("no test trains")
 
 
 @pytest.fixture
 def file(tmp_path, monkeypatch):
-    """A policy's file in an empty folder, for the stub of a simulator and of networks."""
-    network, params = stubs.make_policy()
-
-    def sample(_, stats, keys, observation, trocar):
-        return network(params, 1.0, keys, observation, trocar)
-
-    policy = Policy(lambda key: params, _unused, _unused, sample)
-
-    monkeypatch.setattr(in_env.sim_env, "make", lambda *_, **__: stubs.make_env())
-    monkeypatch.setattr(in_env.policies, "make", lambda *_, **__: policy)
-    monkeypatch.setattr(video, "record", lambda runs, path: path)
-    monkeypatch.chdir(tmp_path)
-    box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
-    made = fakes.trained(
-        method="dp_rcm2",
-        policy=POLICY,
-        train=config.TrainConfig(steps=77),
-        params={"learner": {"unet": {"kernel": jnp.ones(3)}}},
-        normalizer=normalizer.Normalizer(box, None),
-        demos=config.DemosConfig(per_trocar=2, seen_trocars=4),
-        preset="smoke",
-    )
-    policy_file.save(tmp_path / "mine.safetensors", made)
-    return tmp_path / "mine.safetensors"
+    return one_policy.stubbed(tmp_path, monkeypatch)
 
 
 def score(*more):
@@ -214,17 +183,6 @@ def test_the_same_command_again_runs_nothing_twice(file):
     assert chunks and all(path.stat().st_mtime_ns == then for path, then in chunks.items())
 
 
-def test_a_result_from_before_a_setting_was_there_is_of_the_same_trials(file):
-    score("--out", "here", "--no-video")
-    path, film = (file.parent / "here" / name for name in ("result.json", "rollout.mp4"))
-    before = json.loads(path.read_text())
-    del before["config"]["eval"]["ensemble"]
-    path.write_text(json.dumps(before))
-    film.write_bytes(b"film")
-    score("--out", "here", "--no-video")
-    assert film.exists()
-
-
 def test_plans_are_averaged_if_asked_for(file):
     assert score("--eval.ensemble") == 0
     (folder,) = (file.parent / "runs" / "evaluate").glob("*-ensemble")
@@ -270,7 +228,7 @@ def test_trials_are_run_as_the_policy_and_the_flags_say(tmp_path, monkeypatch):
     )
     policy = dataclasses.replace(POLICY, obs_horizon=3, crop_fraction=0.5)
     trained = fakes.trained(method="stardiff", policy=policy, params=None, normalizer=None)
-    policy = Policy(_unused, _unused, _unused, _unused)
+    policy = Policy(unused, unused, unused, unused)
     who = in_env.PolicyInEnv(trained, policy, stubs.make_env(), "")
     flags = {"trials": 5, "time_limit_s": 7.0, "chunk": 2, "video_trials": 3}
     policy_evaluation.rollouts(tmp_path, who, None, config.EvalConfig(**flags), 9)
@@ -446,41 +404,6 @@ def test_a_policy_of_states_meets_no_disturbance_of_images(file):
         stressed("--disturbance", "observation_delay", "--levels", "0", "5")
 
 
-CALIBRATE = ["--policy=mine.safetensors", "--trials=120", "--time-limit-s=1", "--alpha=0.2"]
-
-
-def test_a_calibrated_policy_is_scored_with_its_alarms(file, capsys):
-    assert calibrate.main([*CALIBRATE, "--out=watched.safetensors", "--still-s=0.3"]) == 0
-    (folder,) = (file.parent / "runs" / "calibrate").glob("mine-*-seed1-120x1s")
-    content = json.loads((folder / "monitor.json").read_text())
-    watched, plain = (policy_file.load(name) for name in ("watched.safetensors", file))
-    monitor = watched.monitor
-    assert monitor is not None and plain.monitor is None
-    assert watched._replace(monitor=None)[:3] == plain[:3]
-    assert (monitor.alpha, monitor.settings) == (0.2, (4, 30.0, 2))
-    assert np.isfinite(monitor.limits).sum() == len(scores.CALIBRATED)
-    assert content["monitor"]["count"] == monitor.count < 51
-    assert content["test"]["false_alarms"]["trials"] + content["test"]["announced"]["trials"] == 51
-    with mistakes.of("--out", "watched.safetensors"):
-        calibrate.main([*CALIBRATE, "--out=watched.safetensors"])
-
-    trials = ["--eval.trials=2", "--eval.time-limit-s=1", "--policy=watched.safetensors"]
-    assert evaluate.main([*trials, "--out=scored"]) == 0
-    result = json.loads((file.parent / "scored" / "result.json").read_text())
-    successes = result["strict"]["all"]["successes"]
-    assert result["alarms"]["false_alarms"]["trials"] == successes
-    assert result["alarms"]["announced"]["trials"] == 24 - successes
-    assert evaluate.main([*trials, "--out=averaged", "--eval.ensemble"]) == 0
-    averaged = json.loads((file.parent / "averaged" / "result.json").read_text())
-    assert "alarms" not in averaged
-    offset = ["--disturbance", "trocar_offset", "--levels", "5", "--out", "wrong"]
-    assert stress.main([*trials, *offset]) == 0
-    stressed = json.loads((file.parent / "wrong" / "stress.json").read_text())
-    level = stressed["disturbances"]["trocar_offset"]["levels"]["5"]
-    assert level["alarms"]["false_alarms"]["trials"] == level["strict"]["successes"]
-    assert "Alarms" in (file.parent / "wrong" / "stress.md").read_text()
-
-
 def test_disturbances_at_once_have_a_row_of_their_own(file):
     names = ["trocar_offset", "breathing"]
     at_once = ["--together", "trocar_offset=5", "breathing=2"]
@@ -506,10 +429,3 @@ def test_a_disturbance_may_name_its_levels(file):
         stressed("--disturbance", "trocar_offset=fast")
     with mistakes.of("disturbance", 5.0):
         stressed("--disturbance", "observation_delay=5")
-
-
-def test_too_few_trials_write_no_policy(file):
-    few = ["--trials=20", "--alpha=0.05", "--out=watched.safetensors"]
-    with mistakes.of("trials", "for the scale"):
-        calibrate.main([*CALIBRATE[:1], "--time-limit-s=1", *few])
-    assert not (file.parent / "watched.safetensors").exists()

@@ -13,7 +13,7 @@ from starjax.cli import pack
 from starjax.core import config, errors
 from starjax.data import normalizer
 from starjax.policies import policy_file
-from starjax.policies.monitor import calibrate, scores
+from starjax.policies.monitor import record, scores
 
 POLICY = config.with_options(dataclasses.replace(fakes.TINY, dtype="bfloat16"), temperature=0.5)
 
@@ -90,7 +90,7 @@ def test_a_mistake_names_what_was_wrong(made, tmp_path, argv, argument, got):
 
 @pytest.mark.parametrize("argv", [[], ["--temperature", "0.5"], ["--temperature", "0"]])
 def test_a_monitor_is_kept_unless_samples_change(made, argv):
-    monitor = calibrate.Monitor(
+    monitor = record.Monitor(
         np.zeros(len(scores.NAMES)), np.ones(len(scores.NAMES)),
         1.0, 7.9, 0.05, 20, scores.ScoreSettings(8, 30.0, 6),
         policy_file.monitor_digest(made.params),

@@ -22,7 +22,7 @@ from starjax.deploy import approach, batching, connection_pool, inputs, wire
 from starjax.deploy import served as serving
 from starjax.evaluation import evaluate as evaluating
 from starjax.policies import in_env
-from starjax.policies.monitor import calibrate, scores
+from starjax.policies.monitor import record, scores
 from starjax.rollouts import agent
 from starjax.sim import names
 
@@ -124,7 +124,7 @@ def late(execute):
     """A monitor with an alarm at the first decision after half a second."""
     width = np.where(np.array(scores.NAMES) == "clock", 1.0, 1e9)
     settings = scores.ScoreSettings(execute, 30.0, 2)
-    return calibrate.Monitor(np.zeros(len(width)), width, 0.5, 0.5, 0.1, 20, settings, "weights")
+    return record.Monitor(np.zeros(len(width)), width, 0.5, 0.5, 0.1, 20, settings, "weights")
 
 
 def test_the_monitor_of_a_server_scores_its_trials(tmp_path, monkeypatch):
@@ -185,7 +185,7 @@ def test_images_reach_a_server_and_its_pictures_are_the_environments(tmp_path, m
         in_closed_loop(who, tmp_path)
     requests.get()  # the request of the test
     seen = [requests.get() for _ in range(requests.qsize())]
-    assert len(seen) >= 12 and who.remote.refused == 0
+    assert len(seen) >= 12 and who.server.refused == 0
     for request in seen:
         tip, image = request["observation/state"][:3], request["observation/image"]
         assert image.dtype == np.uint8 and image.shape == (6, 6, 3)  # the stub's size
@@ -225,7 +225,7 @@ def test_refused_plans_hold_and_are_counted(tmp_path):
     with openpi(infer, PLAIN) as address:
         who = serving.connect(address)
         table = in_closed_loop(who, tmp_path)
-    assert who.remote.refused == len(asked) - 1 > 0
+    assert who.server.refused == len(asked) - 1 > 0
     assert not table.success.any() and table.rcm_max.max() < 1e-6
 
 
@@ -251,7 +251,7 @@ def test_a_lost_server_ends_it_in_one_line(tmp_path):
         who = serving.connect(address)
         with mistakes.of(address):
             in_closed_loop(who, tmp_path)
-    assert isinstance(who.remote.fault, connection_pool.LostServer)
+    assert isinstance(who.server.fault, connection_pool.LostServer)
 
 
 @pytest.mark.parametrize(
@@ -266,7 +266,7 @@ def test_a_lost_server_ends_it_in_one_line(tmp_path):
         ({"action_space": "rcm4"}, "answer.actions"),  # and eight columns
         ({"monitor": 5}, "greeting.monitor"),
         ({"monitor": {"scores": ["smell"]}}, "greeting.monitor"),
-        ({"monitor": calibrate.to_json(late(execute=4))}, "greeting.monitor"),  # plans have five
+        ({"monitor": record.to_json(late(execute=4))}, "greeting.monitor"),  # plans have five
     ],
 )
 def test_a_greeting_is_checked(change, field):

@@ -19,7 +19,7 @@ from starjax.core.errors import UsageError
 from starjax.core.types import Command, Pose
 from starjax.deploy import batching, connection_pool, plan_executor, wire
 from starjax.deploy.connection import Connection, Reply
-from starjax.policies.monitor import calibrate, scores
+from starjax.policies.monitor import record, scores
 from starjax.sim import registries
 
 HORIZON, EXECUTE = 16, 8
@@ -256,7 +256,7 @@ def test_a_loop_over_the_socket_is_the_loop_in_the_process(batches):
 
 def clock_monitor(seconds):
     """A monitor with an alarm after so many seconds, and no other."""
-    return calibrate.Monitor(
+    return record.Monitor(
         center=np.zeros(len(scores.NAMES)),
         width=np.array([1e9, 1e9, 1.0, 1e9, 1e9, 1e9]),
         threshold=seconds,

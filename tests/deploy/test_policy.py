@@ -21,7 +21,7 @@ from starjax.core.types import Observation
 from starjax.data import normalizer
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
-from starjax.policies.monitor import calibrate, scores
+from starjax.policies.monitor import record, scores
 from starjax.sim import names, registries
 
 TRAIN = config.TrainConfig()
@@ -545,7 +545,7 @@ def test_the_packaged_policy_commands_what_it_did(prefix, monkeypatch):
 def test_a_monitor_is_loaded_unless_an_option_changes_the_plans(made, tmp_path):
     path, trained, _ = made
     assert load(path).monitor is None
-    monitor = calibrate.Monitor(
+    monitor = record.Monitor(
         np.zeros(len(scores.NAMES)), np.ones(len(scores.NAMES)),
         1.0, 7.9, 0.05, 20, scores.ScoreSettings(8, 30.0, 6),
         policy_file.monitor_digest(trained.params),
@@ -553,5 +553,5 @@ def test_a_monitor_is_loaded_unless_an_option_changes_the_plans(made, tmp_path):
     policy_file.save(tmp_path / "watched.safetensors", trained._replace(monitor=monitor))
     watched = load(tmp_path / "watched.safetensors")
     assert watched.monitor is not None
-    assert calibrate.to_json(watched.monitor) == calibrate.to_json(monitor)
+    assert record.to_json(watched.monitor) == record.to_json(monitor)
     assert load(tmp_path / "watched.safetensors", temperature=0.0).monitor is None

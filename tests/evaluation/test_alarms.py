@@ -8,7 +8,7 @@ import stubs
 
 from starjax.evaluation import alarms, evaluate
 from starjax.evaluation import trials as tables
-from starjax.policies.monitor import calibrate, scores, watch
+from starjax.policies.monitor import record, scores, watch
 from starjax.rollouts import agent, engine, episodes, plans
 
 EXECUTE, HORIZON = 4, 6
@@ -33,7 +33,7 @@ def run(directory, score_settings=SETTINGS, **changed):
 
 
 def monitor(threshold=np.inf, clock_s=0.5):
-    return calibrate.Monitor(
+    return record.Monitor(
         np.zeros(len(scores.NAMES)),
         np.ones(len(scores.NAMES)),
         threshold,

@@ -281,12 +281,15 @@ def test_demonstrations_meet_levels_up_to_the_highest(env):
     assert abs(np.corrcoef(np.array(drawn).T)[0, 1]) < 0.3
 
 
-def test_old_names_are_read_and_seed_the_draws_of_the_new_ones():
-    streams = {kind.stream: name for name, kind in KINDS.items() if kind.stream}
-    assert streams == disturbances.RENAMED
-    with pytest.warns(FutureWarning, match="dropped is now observation_dropout"):
-        levels = disturbances.parse_levels("demos.randomise", ["dropped=0.3", "smoke=0.5"])
-    assert levels == {"observation_dropout": 0.3, "smoke": 0.5}
+def test_texts_other_than_names_seed_some_draws():
+    assert {kind.stream: name for name, kind in KINDS.items() if kind.stream} == {
+        "trocar_told": "trocar_offset",
+        "breathing_late": "breathing_tracked",
+        "late_view": "observation_delay",
+        "late_commands": "action_delay",
+        "dropped": "observation_dropout",
+        "servos": "weak_servos",
+    }
     key = base.start("weak_servos", 0.5, KEY).key
     assert key == jax.random.fold_in(KEY, zlib.crc32(b"servos"))
 

@@ -170,7 +170,7 @@ def test_a_hierarchys_network_predicts_the_turns_of_the_space(name):
     policy = policies.make(METHODS[name], fakes.TINY, held(name))
     batch = windows.gather(fakes.dataset(0), jnp.array([3]), 2, 16)
     prepared = jax.eval_shape(policy.prepare, fitted(name), jax.random.key(0), batch)
-    assert prepared.roll.shape[-1] == (3 if "wrist" in name else 1)
+    assert prepared.lesson.target.shape[-1] == (3 if "wrist" in name else 1)
     assert "roll_loss" in policy.metrics
     with pytest.raises(ValueError, match="turns and position"):
         policies.make(METHODS["toy_relative"]._replace(hierarchical=True), fakes.TINY, fakes.TASK)

@@ -15,7 +15,6 @@ from starjax.core import errors, methods
 from starjax.evaluation import latency
 from starjax.policies import features, packaged, policy_file
 from starjax.policies import policy as policies
-from starjax.policies.models.kernels import parallel_ddim
 from starjax.sim import registries
 
 MOST = 12e6  # bytes of a file
@@ -69,6 +68,7 @@ def test_five_evaluations_side_by_side_are_enough_for_what_is_packaged(monkeypat
         return jax.jit(lambda *given: policy.sample(*given))(*given)
 
     wanted = planned()
+    parallel_ddim = pytest.importorskip("starjax.addons.decisions.parallel_ddim")
     monkeypatch.setattr(parallel_ddim, "pays", lambda batch, steps: True)
     found = planned()
     distance = np.linalg.norm(found.pose.p - wanted.pose.p, axis=-1)

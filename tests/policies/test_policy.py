@@ -17,7 +17,7 @@ from starjax.data import normalizer, windows
 from starjax.policies import execution, features, generator, hierarchical
 from starjax.policies import policy as policies
 from starjax.policies.models import encoders, roll_net
-from starjax.policies.models.kernels import packed_params, sampling_unet
+from starjax.policies.models.kernels import packed_params
 
 STRAIGHT = [name for name, row in METHODS.items() if not normalizer.has_wrist(row)]
 TRAIN = config.TrainConfig(state_noise=0.0)
@@ -282,7 +282,7 @@ def test_what_both_networks_read_is_encoded_once(dataset, monkeypatch):
 
 def test_hierarchy_needs_a_roll():
     method = METHODS["dp_rcm1"]._replace(hierarchical=True)
-    with pytest.raises(ValueError, match=r"method.action_space: expected one of roll and position"):
+    with pytest.raises(ValueError, match="expected one of turns and position"):
         policies.make(method, fakes.TINY, fakes.TASK, TRAIN)
 
 
@@ -367,6 +367,7 @@ def test_a_gpu_is_handed_fewer_arrays_that_say_the_same(made, name, monkeypatch)
     chex.assert_trees_all_equal(
         it.policy.prepare_for_inference(params), params
     )  # as a CPU is handed them
+    sampling_unet = pytest.importorskip("starjax.addons.decisions.sampling_unet")
     monkeypatch.setattr(sampling_unet, "pays", lambda: True)
     monkeypatch.setattr(packed_params, "PLATFORMS", {"cpu"})
     ready = it.policy.prepare_for_inference(params)
@@ -398,16 +399,17 @@ def test_the_losses_are_weighed(made):
 def test_the_roll_network_learns_from_inexact_inputs_what_is_exact(made):
     it = made("stardiff")
     given, batch = prepared(it)
+    given = given.lesson
     exact = jit(lambda x: features.encode_commands(it.stats, "rcm4", x))(batch)
     seen = jit(lambda x: features.encode_proprioception(it.stats, "rcm4", x.observation, x.trocar))(
         batch
     )
-    p = np.ravel(given.p[:, :, 0] - exact[..., 1:4])
+    p = np.ravel(given.path[:, :, 0] - exact[..., 1:4])
     roll = np.ravel(given.history[:, :, 0] - seen[..., :1])
     assert p.std() == pytest.approx(hierarchical.POSITION_NOISE, rel=0.1)
     assert roll.std() == pytest.approx(hierarchical.ROLL_NOISE, rel=0.2)
     assert abs(np.corrcoef(p[: roll.size], roll)[0, 1]) < 0.4
-    np.testing.assert_allclose(given.roll[:, :, 0], exact[..., :1], atol=1e-6)
+    np.testing.assert_allclose(given.target[:, :, 0], exact[..., :1], atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["stardiff", "dp_rcm4"])
@@ -507,8 +509,8 @@ def test_the_roll_network_of_training_is_that_of_sampling(made, monkeypatch):
     policy = policies.make(it.method, it.settings, fakes.TASK, TRAIN)
     given, _ = prepared(it)
     _, parts = jit(policy.loss)(it.params, given)
-    rolls, history = given.roll[..., 0], given.history[..., 0]
-    expected = jnp.mean((rolls - history[:, -1:] - given.p[..., 0]) ** 2)
+    path, history, rolls = (x[..., 0] for x in given.lesson)
+    expected = jnp.mean((rolls - history[:, -1:] - path) ** 2)
     assert float(parts["roll_loss"]) == pytest.approx(float(expected), rel=1e-5)
     seen, trocar = it.batch.observation, it.batch.trocar
     keys = jax.random.split(jax.random.key(1), B)

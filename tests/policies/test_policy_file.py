@@ -14,7 +14,7 @@ import safetensors.numpy
 
 from starjax.data import normalizer
 from starjax.policies import packaged, policy_file
-from starjax.policies.monitor import calibrate, scores
+from starjax.policies.monitor import record, scores
 from starjax.sim import names
 
 POLICY = dataclasses.replace(fakes.TINY, crop_fraction=0.8)
@@ -39,7 +39,7 @@ def trained(scale=1.0):
 
 
 def with_monitor(policy, digest=None):
-    monitor = calibrate.Monitor(
+    monitor = record.Monitor(
         center=np.array([1e-3, -2e-3, 6.7, np.nan]),
         width=np.array([0.1, 0.2, 1.0, np.nan]) / 3,
         threshold=1.25,
@@ -57,7 +57,7 @@ def test_a_monitor_stays_with_its_weights_also_in_half_precision(tmp_path, half)
     path, made = tmp_path / "policy.safetensors", with_monitor(trained(scale=1 / 3))
     policy_file.save(path, made, half=half)
     found = policy_file.load(path)
-    assert calibrate.to_json(found.monitor) == calibrate.to_json(made.monitor)
+    assert record.to_json(found.monitor) == record.to_json(made.monitor)
     assert policy_file.is_half(found.params) == half
     policy_file.save(path, found._replace(monitor=None), half=half)
     assert policy_file.load(path).monitor is None
@@ -83,9 +83,9 @@ def test_a_file_beside_the_weights_has_a_newer_monitor(tmp_path):
     path, made = tmp_path / "policy.safetensors", with_monitor(trained())
     policy_file.save(path, made)
     before, beside = path.read_bytes(), policy_file.monitor_path(path)
-    newer = calibrate.to_json(made.monitor) | {"threshold": 0.5}
+    newer = record.to_json(made.monitor) | {"threshold": 0.5}
     beside.write_text(json.dumps(newer))
-    assert calibrate.to_json(policy_file.load(path).monitor) == newer
+    assert record.to_json(policy_file.load(path).monitor) == newer
     assert path.read_bytes() == before
     other = {"digest": policy_file.monitor_digest(trained(2.0).params)}
     decisions = {"settings": newer["settings"] | {"execute": 4}}

@@ -140,8 +140,8 @@ def test_turns_are_about_the_own_x_axis_and_the_network_learns_the_missing_one()
     np.testing.assert_allclose(turned, R @ about_x, atol=1e-6)
 
     policy, stats, _, batch = made("stardiff_pose")
-    given = jit(policy.prepare)(stats, jax.random.key(0), batch)
-    angle = pose_hierarchy.TURN * jnp.broadcast_to(given.turn[:, None], given.path.shape[:-1])
+    given = jit(policy.prepare)(stats, jax.random.key(0), batch).lesson
+    angle = pose_hierarchy.TURN * jnp.broadcast_to(given.target[..., 0], given.path.shape[:-1])
     again = pose_hierarchy.turned(given.path[..., 3:], angle)
     np.testing.assert_allclose(rcm.rot6d_decode(again), batch.command.pose.R, atol=1e-5)
 

@@ -14,8 +14,9 @@ from starjax.runtime import files
 
 
 def stress(file, weights=synthetic.WEIGHTS, version=protocol.VERSION, **changed):
-    """stress.json of two disturbances, one of them by its old name."""
-    score = {"strict": {"successes": 54, "trials": 108}}
+    """stress.json of two disturbances."""
+    error = {"rcm_error_mm": {"executed": {"mean": 0.01, "p99": 0.02}}}
+    score = {"strict": {"successes": 54, "trials": 108}, **error}
     content = {
         "scene": {"task": "peg_transfer", "arms": ["fr5"], "tools": [], "cameras": []},
         "method": "dp_ee",
@@ -24,8 +25,11 @@ def stress(file, weights=synthetic.WEIGHTS, version=protocol.VERSION, **changed)
         "trials_at_each_trocar": protocol.STRESS_TRIALS,
         "time_limit_s": 60.0,
         "disturbances": {
-            "camera": {"levels": {"2": {"strict": {"successes": 1, "trials": 2}}, "10": score}},
-            "late_view": {"levels": {"4": score}},
+            "camera": {
+                "unit": "mm",
+                "levels": {"2": {"strict": {"successes": 1, "trials": 2}, **error}, "10": score},
+            },
+            "observation_delay": {"unit": "steps", "levels": {"4": score}},
         },
         "commit": "c0ffee",
         "command": "starjax stress",

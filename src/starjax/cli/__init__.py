@@ -31,9 +31,6 @@ CORE = {
     "sweep": Subcommand(
         "starjax.cli.sweep", "evaluate a policy on a grid or sample of trocars", _LEARNING
     ),
-    "calibrate": Subcommand(
-        "starjax.cli.calibrate", "add a runtime monitor to a trained policy", _LEARNING
-    ),
     "stress": Subcommand("starjax.cli.stress", "evaluate a policy under disturbances", _LEARNING),
     "bench": Subcommand(
         "starjax.cli.bench", "measure the inference latency of a policy (Table IV)", _LEARNING

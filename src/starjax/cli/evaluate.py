@@ -5,7 +5,7 @@ import functools
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from starjax.cli import (
     benchmark_args,
@@ -19,6 +19,9 @@ from starjax.cli.folders import is_under_way
 from starjax.core import config as config_lib
 from starjax.core import config_json, errors, extras, methods
 from starjax.runtime import files
+
+if TYPE_CHECKING:  # for annotations alone
+    from starjax.policies.in_env import PolicyInEnv
 
 DESCRIPTION = """Scores a trained policy on its task's trocars and records a video.
 
@@ -117,7 +120,9 @@ def _parse(argv: Sequence[str], has_gpu: bool) -> tuple[EvaluateArgs, policy_arg
     return args, path, path.folder("evaluate", parts, args.out)
 
 
-def _is_same(folder: Path, who: Any, args: EvaluateArgs, scene: config_lib.SceneConfig) -> bool:
+def _is_same(
+    folder: Path, who: "PolicyInEnv", args: EvaluateArgs, scene: config_lib.SceneConfig
+) -> bool:
     """Returns True if the directory's result has this policy and these trials.
 
     Raises:
@@ -128,8 +133,7 @@ def _is_same(folder: Path, who: Any, args: EvaluateArgs, scene: config_lib.Scene
         _refuse_foreign(folder, before.get("weights", weights) == weights)
     trials = dataclasses.asdict(config_lib.EvalConfig(**vars(args.eval)))
     policy = config_json.as_json(who.trained.policy)
-    # Older results lack settings that were added later.
-    has_same_policy = policy == policy | (before.get("config") or {}).get("policy", {})
+    has_same_policy = policy == (before.get("config") or {}).get("policy")
     return has_same_policy and _identity(before) == (weights, args.seed, list(scene.arm), trials)
 
 
@@ -145,9 +149,8 @@ def _identity(result: dict[str, Any]) -> tuple[Any, Any, Any, Any]:
     """Returns weights, seed, arms and settings of a result's trials."""
     config = result.get("config") or {}
     arms = (config.get("scene") or {}).get("arm")
-    # Older results lack settings that were added later.
-    trials = dataclasses.asdict(config_lib.EvalConfig()) | (config.get("eval") or {})
-    return result.get("weights"), result.get("seed"), arms, trials | {"seed": None}
+    trials = (config.get("eval") or {}) | {"seed": None}
+    return result.get("weights"), result.get("seed"), arms, trials
 
 
 def _refuse_foreign(folder: Path, has_same_weights: bool) -> None:

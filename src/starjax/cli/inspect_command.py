@@ -7,7 +7,7 @@ from typing import Annotated, Any, NamedTuple
 
 import tyro
 
-from starjax.cli import checks, inspect_page, options
+from starjax.cli import checks, options
 from starjax.core import errors, extensions
 from starjax.core.limits import Range
 from starjax.runtime import files, hub, xla
@@ -54,12 +54,12 @@ def main(argv: Sequence[str]) -> int:
     summary = inspect(args.path)
     if args.page:
         path = hub.dataset("PATH", args.path)
-        odd = inspect_page.write(
-            path, args.map, Path(args.page), summary.rows, summary.odd, args.image_size
-        )
+        if (write := extensions.hook("dataset_page")) is None:
+            raise errors.UsageError("--page", "the add-on viewer", "none")
+        odd = write(path, args.map, Path(args.page), summary.rows, summary.odd, args.image_size)
         summary = Found([*summary.rows, ("page", args.page)], odd)
     elif args.map:
-        _, odd = inspect_page.mapped(hub.dataset("PATH", args.path), args.map)
+        _, odd = extensions.hook("inspect_page")(hub.dataset("PATH", args.path), args.map)
         summary = Found(summary.rows, list(dict.fromkeys([*summary.odd, *odd])))
     width = max(len(name) for name, _ in summary.rows)
     for name, text in summary.rows:

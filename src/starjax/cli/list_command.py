@@ -10,7 +10,7 @@ import tyro
 from starjax.cli import options, presets
 from starjax.core import errors, extensions, methods
 from starjax.core.config import RunConfig
-from starjax.core.learners import ENCODERS, LEARNERS
+from starjax.core.learners import ENCODERS, LEARNERS, Learner
 from starjax.policies import packaged
 from starjax.policies.external import POLICIES
 from starjax.runtime import files
@@ -20,6 +20,9 @@ from starjax.sim.registries import Registry
 from starjax.sim.tools.base import Tool
 
 if TYPE_CHECKING:  # it imports jax, which `--help` does without
+    from starjax.evaluation.disturbances.base import Disturbance
+    from starjax.policies.models.encoders import Trunk
+    from starjax.rcm import ActionSpace
     from starjax.sim.task import Task
 
 DESCRIPTION = """Lists tasks, arms, tools, methods, learners, presets and policies by name.
@@ -122,19 +125,19 @@ def _method(row: methods.Method) -> str:
     return f"{row.label}: actions {row.action_space}{rolls}{condition}"
 
 
-def _space(space: Any) -> str:
+def _space(space: "ActionSpace") -> str:
     return f"{space.dim} numbers: {', '.join(space.slices)}"
 
 
-def _encoder(trunk: Any) -> str:
+def _encoder(trunk: "Trunk") -> str:
     return f"{trunk.width} channels, cells of {trunk.cell} pixels"
 
 
-def _learner(learner: Any) -> str:
+def _learner(learner: Learner) -> str:
     return ", ".join(field.name for field in dataclasses.fields(learner.settings))
 
 
-def _disturbance(disturbance: Any) -> str:
+def _disturbance(disturbance: "Disturbance") -> str:
     return disturbance.description
 
 

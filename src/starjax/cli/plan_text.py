@@ -10,6 +10,8 @@ from starjax.cli import messages, presets
 from starjax.core import config as config_lib
 from starjax.core import methods
 from starjax.policies import packaged, policy_file
+from starjax.policies import policy as policies
+from starjax.policies.in_env import Server
 from starjax.runtime import stored, xla
 from starjax.sim import registries
 from starjax.sim.task import CONTROL_HZ
@@ -165,8 +167,6 @@ def _scene_of(encoder_weights: str) -> Any:
 
 def _ablations(method: str, policy: config_lib.PolicyConfig) -> list[str]:
     """Returns the active ablations: settings that deviate from the method's row."""
-    from starjax.policies import policy as policies
-
     rows = [methods.SCORED[name] for name in methods.selected(method)]
     sees = policy.sees_trocar
     given = "given" if sees == "always" else "not given"
@@ -208,12 +208,12 @@ def warnings(config: config_lib.RunConfig, figures: Mapping[str, Any]) -> list[s
     return lines + _diverged(figures)
 
 
-def served_warnings(who: Any, figures: Mapping[str, Any]) -> list[str]:
+def served_warnings(server: Server, figures: Mapping[str, Any]) -> list[str]:
     """Returns warnings for readers of a served policy's result."""
-    lines = [f"Policy served at {who.origin['address']}; its settings of training are unknown."]
-    if who.remote.refused:
+    lines = [f"Policy served at {server.origin['address']}; its settings of training are unknown."]
+    if server.refused:
         lines.append(
-            f"{who.remote.refused} plan(s) were refused by the server or invalid; the robot held "
+            f"{server.refused} plan(s) were refused by the server or invalid; the robot held "
             "its pose."
         )
     return lines + _diverged(figures)

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from starjax.cli import checks, folders, options, scenes
 from starjax.core import config as config_lib
@@ -15,6 +15,10 @@ from starjax.core import errors, extras
 from starjax.policies import packaged
 from starjax.policies.external import POLICIES
 from starjax.runtime import files
+
+if TYPE_CHECKING:  # they import jax
+    from starjax.policies.in_env import PolicyInEnv
+    from starjax.policies.policy_file import Trained
 
 SCHEMES = ("ws://", "wss://")
 SAMPLING = "--sampling"  # flag of evaluate
@@ -126,12 +130,11 @@ def label(file: Path) -> str:
     return f"{name}-{files.sha256(file)[:8]}"
 
 
-def load(path: PolicyPath) -> tuple[Any, config_lib.RunConfig]:
+def load(path: PolicyPath) -> tuple["PolicyInEnv", config_lib.RunConfig]:
     """Loads a policy in its scene.
 
     Returns:
-      `in_env.PolicyInEnv` or `served.ServedPolicy`, and the settings of the run that it
-      comes from as far as known.
+      The policy, and the settings of the run that it comes from as far as known.
     """
     from starjax.cli import policy_evaluation  # it imports jax
     from starjax.policies import in_env
@@ -165,7 +168,7 @@ def load(path: PolicyPath) -> tuple[Any, config_lib.RunConfig]:
     return who, dataclasses.replace(config, policy=trained.policy, train=trained.train, demos=demos)
 
 
-def run_settings(trained: Any) -> config_lib.RunConfig:
+def run_settings(trained: "Trained") -> config_lib.RunConfig:
     """Returns the settings of a policy's run, as far as its file has them."""
     settings = config_lib.RunConfig(
         method=trained.method,

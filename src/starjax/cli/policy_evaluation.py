@@ -1,10 +1,9 @@
 """A trained policy in closed loop: rollouts of a method, and the result.json that they become."""
 
-import contextlib
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Union
+from typing import Any
 
 import jax
 import numpy as np
@@ -20,16 +19,11 @@ from starjax.evaluation import trials as table
 from starjax.policies import features, in_env, policy_file
 from starjax.policies import policy as policies
 from starjax.policies.in_env import PolicyInEnv
-from starjax.policies.monitor.calibrate import Monitor
+from starjax.policies.monitor.record import Monitor
 from starjax.policies.monitor.scores import ScoreSettings
 from starjax.rollouts import placement
 from starjax.runtime.precompile import Program
 from starjax.sim.state import Env
-
-if TYPE_CHECKING:
-    from starjax.deploy.served import ServedPolicy
-
-Who = Union[PolicyInEnv, "ServedPolicy"]
 
 
 def load(method: str, weights: Path, arms: Sequence[str] = ()) -> PolicyInEnv:
@@ -60,7 +54,7 @@ def read(weights: Path) -> policy_file.Trained:
 
 def rollouts(
     directory: Path,
-    who: Who,
+    who: PolicyInEnv,
     trocars: rcm.Trocar,
     settings: config_lib.TrialsConfig,
     seed: int,
@@ -81,8 +75,7 @@ def rollouts(
     trained = who.trained
     if score_settings is None and (monitor := monitor_of(who, settings)):
         score_settings = monitor.settings
-    is_file = isinstance(who, PolicyInEnv)
-    with contextlib.nullcontext() if is_file else who.faults():
+    with who.faults():
         return evaluate.evaluate(
             directory,
             who.env,
@@ -94,7 +87,7 @@ def rollouts(
             identity={
                 **methods.behaviour(trained.method)._asdict(),
                 "policy": config_json.as_json(trained.policy),
-                **({} if is_file else {"served": who.weights}),
+                **({"served": who.weights} if who.server else {}),
             },
             levels=levels,
             score_settings=score_settings,
@@ -102,7 +95,7 @@ def rollouts(
         )
 
 
-def monitor_of(who: Who, settings: config_lib.TrialsConfig) -> Monitor | None:
+def monitor_of(who: PolicyInEnv, settings: config_lib.TrialsConfig) -> Monitor | None:
     """Returns the policy's monitor, None if its plans are averaged: it compares single plans."""
     return None if settings.ensemble else who.trained.monitor
 
@@ -153,7 +146,7 @@ def _settings(settings: config_lib.TrialsConfig, seed: int) -> evaluate.Evaluati
     )
 
 
-def inference_ms(who: Who) -> dict[str, float]:
+def inference_ms(who: PolicyInEnv) -> dict[str, float]:
     """Measures the time of one inference at batch size 1, from observation to commands."""
     trained = who.trained
     return latency.policy_ms(
@@ -168,7 +161,7 @@ def inference_ms(who: Who) -> dict[str, float]:
 
 def write_result(
     folder: Path,
-    who: Who,
+    who: PolicyInEnv,
     trials: table.Table,
     config: config_lib.RunConfig,
     seed: int,
@@ -208,6 +201,7 @@ def write_result(
     }
     if monitor := monitor_of(who, config.eval):
         about["alarms"] = alarms.compose(trials, monitor)
-    if not isinstance(who, PolicyInEnv):
-        about |= {"server": who.origin, "warnings": plan_text.served_warnings(who, figures)}
+    if who.server:
+        warnings = plan_text.served_warnings(who.server, figures)
+        about |= {"server": who.server.origin, "warnings": warnings}
     return results.write(folder / "result.json", who.env.names, figures, about)

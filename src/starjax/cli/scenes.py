@@ -2,11 +2,14 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from starjax.core import config as config_lib
 from starjax.core import errors, methods
 from starjax.sim.names import SceneNames
+
+if TYPE_CHECKING:  # for annotations alone
+    from starjax.sim.state import Env
 
 
 def settings(names: SceneNames) -> config_lib.SceneConfig:
@@ -21,7 +24,7 @@ def names(scene: config_lib.SceneConfig) -> SceneNames:
     return SceneNames(scene.task, scene.arm, scene.tool, scene.camera)
 
 
-def disturbable(env: Any, disturbances: Sequence[str], policy: config_lib.PolicyConfig) -> Any:
+def disturbable(env: "Env", disturbances: Sequence[str], policy: config_lib.PolicyConfig) -> Any:
     """Returns the environment, with cameras that move and a look that varies as they must."""
     from starjax.evaluation.disturbances import DISTURBANCES
     from starjax.sim import env as sim_env

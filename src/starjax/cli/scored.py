@@ -42,8 +42,7 @@ def _read(folder: Path, weights: str) -> Any:
         scored = result.read(folder / "result.json")
     except (FileNotFoundError, ValueError):  # damaged: made again
         return None
-    # older results do not say whose they are
-    return scored if scored.trials and scored.weights in (None, weights) else None
+    return scored if scored.trials and scored.weights == weights else None
 
 
 def _is_of(scored: Any, config: config_lib.RunConfig) -> bool:
@@ -54,4 +53,4 @@ def _is_of(scored: Any, config: config_lib.RunConfig) -> bool:
         return False
     alike = config_json.weight_settings(before) == config_json.weight_settings(config)
     now = dataclasses.replace(config.eval, seed=before.eval.seed)
-    return alike and before.eval == now and scored.seed in (None, config.trial_seed)
+    return alike and before.eval == now and scored.seed == config.trial_seed

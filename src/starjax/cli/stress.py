@@ -4,7 +4,7 @@ import dataclasses
 import importlib.util
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from starjax.cli import benchmark_args, messages, options, policy_args, scenes, session
 from starjax.core import config as config_lib
@@ -13,6 +13,9 @@ from starjax.core.limits import NotNegative
 from starjax.core.registry import Rows
 from starjax.evaluation import disturbances, protocol
 from starjax.runtime import files
+
+if TYPE_CHECKING:  # for annotations alone
+    from starjax.policies.in_env import PolicyInEnv
 
 DESCRIPTION = """Scores a trained policy on its task's trocars under disturbances.
 
@@ -69,7 +72,7 @@ def main(argv: Sequence[str]) -> int:
         "scene": who.env.names._asdict(),
         "method": who.trained.method,
         "weights": who.weights,
-        **({"server": who.origin} if path.address else {}),
+        **({"server": who.server.origin} if who.server else {}),
         "seed": args.seed,
         "trials_at_each_trocar": args.eval.trials,
         "time_limit_s": args.eval.time_limit_s,
@@ -149,7 +152,7 @@ def _check_together(levels: dict[str, float], tested: list[str]) -> None:
         base.check_levels("together", name, [level])
 
 
-def _disturbed(who: Any, names: list[str]) -> Any:
+def _disturbed(who: "PolicyInEnv", names: list[str]) -> Any:
     """Returns the policy in an environment whose one program has every level of all of these."""
     from starjax.evaluation.disturbances import base
 
@@ -157,7 +160,9 @@ def _disturbed(who: Any, names: list[str]) -> Any:
     return who._replace(env=base.with_disturbances(env, names))
 
 
-def _score(folder: Path, who: Any, levels: dict[str, float], args: StressArgs) -> dict[str, Any]:
+def _score(
+    folder: Path, who: "PolicyInEnv", levels: dict[str, float], args: StressArgs
+) -> dict[str, Any]:
     """Returns success, RCM error, force on the abdominal wall and alarms in a level's trials."""
     from starjax.cli import policy_evaluation
     from starjax.evaluation import alarms, statistics, wall

@@ -5,12 +5,15 @@ import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from starjax.cli import benchmark_args, checks, folders, messages, options, policy_args, session
 from starjax.core import config as config_lib
 from starjax.core.limits import CountOrZero, Range
 from starjax.runtime import files
+
+if TYPE_CHECKING:  # for annotations alone
+    from starjax.sim.task import Task
 
 DESCRIPTION = """Scores a trained policy on a random sample (Eq. 19) or a grid of trocars.
 
@@ -139,7 +142,7 @@ def _trials(folder: Path, args: SweepArgs) -> Path:
     return folder / "sweep" / f"seed{args.seed}-{digest[:8]}"
 
 
-def _trocars(args: SweepArgs, task: Any) -> Any:
+def _trocars(args: SweepArgs, task: "Task") -> Any:
     """Returns the sample or the grid of trocars."""
     import numpy as np
 

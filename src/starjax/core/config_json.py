@@ -37,7 +37,7 @@ def differing_settings(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     default = as_json(RunConfig())
     parts = [part for part in _WEIGHT_SECTIONS if part != "seed"]
     filled = [{part: default[part] | old.get(part, {}) for part in parts} for old in configs]
-    rows = [_flat(values | {"policy": _without_frame(values["policy"])}) for values in filled]
+    rows = [_flat(values) for values in filled]
     return [
         name
         for name in dict.fromkeys(name for row in rows for name in row)
@@ -103,9 +103,6 @@ def from_dict(settings: type[SettingsT], values: Mapping[str, Any]) -> SettingsT
 
 def _nested(policy: Mapping[str, Any]) -> dict[str, Any]:
     """Returns a policy's settings with the learner's options in a part of their own."""
-    if (frame := policy.get("frame", "world")) != "world":
-        raise ValueError(f"PolicyConfig.frame: expected world, the only frame left, got {frame!r}")
-    policy = _without_frame(policy)
     learner = policy.get("learner", PolicyConfig.learner)
     if not isinstance(learner, str):
         raise ValueError(f"PolicyConfig.learner: expected str, got {learner!r}")
@@ -114,11 +111,3 @@ def _nested(policy: Mapping[str, Any]) -> dict[str, Any]:
     options = {name: value for name, value in policy.items() if name not in shared}
     rest = {name: value for name, value in policy.items() if name in shared}
     return {**rest, "options": from_dict(settings, options)}
-
-
-def _without_frame(policy: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns a policy's settings without the frame of its positions where that is the world.
-
-    Version 0.2.0 knew another one, the endoscope's, in which policies learned less.
-    """
-    return {name: value for name, value in policy.items() if (name, value) != ("frame", "world")}

@@ -1,7 +1,6 @@
 """Errors of users as three fields and one line. Imports the standard library only."""
 
 import difflib
-import warnings
 from collections.abc import Iterable
 from typing import Any
 
@@ -58,9 +57,3 @@ def nearest(word: str, known: Iterable[str]) -> str:
         near = [name for name in names if name.startswith(low)]
         near = near or [name for name in names if low in name.lower()]
     return f"did you mean {' or '.join(near[:_SUGGESTIONS])}?" if near else ""
-
-
-def warn_renamed(old: str, new: str) -> None:
-    """Warns of a name that the next release drops; the command line shows one line."""
-    # FutureWarning, as Python shows it to users by default; DeprecationWarning it hides.
-    warnings.warn(f"{old} is now {new}; the next release drops {old}", FutureWarning, stacklevel=1)

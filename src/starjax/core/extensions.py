@@ -94,7 +94,8 @@ def hook(place: str) -> Any:
 
     Places: `inspect` (path -> `inspect_command.Found`) and `inspect_page` (path, name of a mapping
     -> motions, anomalies) for datasets that are not starjax's, `list` (() -> tables of
-    `starjax list`), `playback` (runs -> `report.page.Playback` or None).
+    `starjax list`), `playback` (runs -> `report.page.Playback` or None), `dataset_page` (writes the
+    page of `starjax inspect`).
     """
     for table in tables().values():
         if place in table.hooks:

@@ -19,8 +19,7 @@ class Method(NamedTuple):
       projects: poses are projected onto the RCM manifold at execution.
       hierarchical: the learner for (position, gripper), or (pose, gripper), and a network for the
         rest, such as the roll; else one model.
-      weights_of: the method whose weights it shares (its own name if it trains its own, which an
-        empty one of another package means).
+      weights_of: the method whose weights it shares; empty for its own.
       label: name in tables; empty for its name.
       group: group in Tables II and III; further rows have another.
     """
@@ -38,77 +37,44 @@ _NAIVE, _RCM, _OURS = "Naive", "RCM action spaces", "Ours"
 _BESIDE, _OTHERS, _WRIST = "Ours (ablation)", "Other packages", "With a wrist"
 
 _BUILT_IN: dict[str, Method] = {
-    "dp_ee": Method("se3", weights_of="dp_ee", label="DP-EE", group=_NAIVE),
+    "dp_ee": Method("se3", label="DP-EE", group=_NAIVE),
     "dp_ee_proj": Method(
         "se3", projects=True, weights_of="dp_ee", label="DP-EE-Proj", group=_NAIVE
     ),
-    "dp_rcm1": Method("rcm1", sees_trocar=True, weights_of="dp_rcm1", label="DP-RCM-1", group=_RCM),
-    "dp_rcm2": Method("rcm2", sees_trocar=True, weights_of="dp_rcm2", label="DP-RCM-2", group=_RCM),
-    "dp_rcm3": Method("rcm3", sees_trocar=True, weights_of="dp_rcm3", label="DP-RCM-3", group=_RCM),
-    "dp_rcm4": Method("rcm4", sees_trocar=True, weights_of="dp_rcm4", label="DP-RCM-4", group=_RCM),
+    "dp_rcm1": Method("rcm1", sees_trocar=True, label="DP-RCM-1", group=_RCM),
+    "dp_rcm2": Method("rcm2", sees_trocar=True, label="DP-RCM-2", group=_RCM),
+    "dp_rcm3": Method("rcm3", sees_trocar=True, label="DP-RCM-3", group=_RCM),
+    "dp_rcm4": Method("rcm4", sees_trocar=True, label="DP-RCM-4", group=_RCM),
     # Table II's own note: STAR-Diff-Single and DP-RCM-4 are one model, listed in both groups.
     "stardiff_single": Method(
         "rcm4", sees_trocar=True, weights_of="dp_rcm4", label="STAR-Diff-Single", group=_OURS
     ),
-    "stardiff": Method(
-        "rcm4", hierarchical=True, weights_of="stardiff", label="STAR-Diff", group=_OURS
-    ),
+    "stardiff": Method("rcm4", hierarchical=True, label="STAR-Diff", group=_OURS),
     # By Proposition 1 the position model needs no trocar; this one is conditioned on it too.
     "stardiff_told": Method(
-        "rcm4",
-        sees_trocar=True,
-        hierarchical=True,
-        weights_of="stardiff_told",
-        label="STAR-Diff-Told",
-        group=_BESIDE,
+        "rcm4", sees_trocar=True, hierarchical=True, label="STAR-Diff-Told", group=_BESIDE
     ),
-    "dp_ee_wrist": Method("se3_wrist", weights_of="dp_ee_wrist", label="DP-EE-Wrist", group=_WRIST),
+    "dp_ee_wrist": Method("se3_wrist", label="DP-EE-Wrist", group=_WRIST),
     "dp_ee_proj_wrist": Method(
-        "se3_wrist",
-        projects=True,
-        weights_of="dp_ee_wrist",
-        label="DP-EE-Proj-Wrist",
-        group=_WRIST,
+        "se3_wrist", projects=True, weights_of="dp_ee_wrist", label="DP-EE-Proj-Wrist", group=_WRIST
     ),
-    "dp_rcm6": Method(
-        "rcm6", sees_trocar=True, weights_of="dp_rcm6", label="DP-RCM-6", group=_WRIST
-    ),
+    "dp_rcm6": Method("rcm6", sees_trocar=True, label="DP-RCM-6", group=_WRIST),
     # Two heirs of STAR-Diff. By position: the network gives roll and wrist. By pose: the wrist
     # follows exactly, and the network only turns the jaws about their own axis of yaw.
-    "stardiff_wrist": Method(
-        "rcm6",
-        hierarchical=True,
-        weights_of="stardiff_wrist",
-        label="STAR-Diff-Wrist",
-        group=_WRIST,
-    ),
-    "stardiff_pose": Method(
-        "se3_through",
-        hierarchical=True,
-        weights_of="stardiff_pose",
-        label="STAR-Diff-Pose",
-        group=_WRIST,
-    ),
+    "stardiff_wrist": Method("rcm6", hierarchical=True, label="STAR-Diff-Wrist", group=_WRIST),
+    "stardiff_pose": Method("se3_through", hierarchical=True, label="STAR-Diff-Pose", group=_WRIST),
     # Controls: generators with the trocar as input, and one model without it.
     "stardiff_wrist_told": Method(
-        "rcm6",
-        sees_trocar=True,
-        hierarchical=True,
-        weights_of="stardiff_wrist_told",
-        label="STAR-Diff-Wrist-Told",
-        group=_WRIST,
+        "rcm6", sees_trocar=True, hierarchical=True, label="STAR-Diff-Wrist-Told", group=_WRIST
     ),
     "stardiff_pose_told": Method(
         "se3_through",
         sees_trocar=True,
         hierarchical=True,
-        weights_of="stardiff_pose_told",
         label="STAR-Diff-Pose-Told",
         group=_WRIST,
     ),
-    "dp_rcm6_untold": Method(
-        "rcm6", weights_of="dp_rcm6_untold", label="DP-RCM-6-Untold", group=_WRIST
-    ),
+    "dp_rcm6_untold": Method("rcm6", label="DP-RCM-6-Untold", group=_WRIST),
 }
 
 
@@ -118,7 +84,8 @@ def _complete(name: str, row: Method) -> Method:
 
 
 def _rows(built_in: Mapping[str, Method]) -> Rows:
-    return Rows(Registry("method", built_in, "starjax.core.methods:Method"), _complete)
+    rows = {name: _complete(name, row) for name, row in built_in.items()}
+    return Rows(Registry("method", rows, "starjax.core.methods:Method"), _complete)
 
 
 METHODS: Rows = _rows(_BUILT_IN)

@@ -5,8 +5,11 @@ import sys
 # Old package or module -> new one, each without "starjax.".
 NAMES = {
     "data.formats": "addons.formats",
+    "commands.calibrate": "addons.finetune.commands.calibrate",
     "deploy.crtk": "addons.robots.crtk",
     "deploy.psm": "addons.robots.psm",
+    "envs.exported": "addons.formats.exported",
+    "envs.on_device": "addons.playground.on_device",
     "envs.playground": "addons.playground.environment",
     "envs.playground_registry": "addons.playground.registry",
     "finetune": "addons.finetune",

@@ -17,9 +17,11 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from starjax import rcm
 from starjax.core import errors, methods
+from starjax.core.types import Pose
 from starjax.data import windows
 from starjax.sim import wrists
 from starjax.sim.task import Field, Task
@@ -64,11 +66,11 @@ class Normalizer:
 
 def encode(
     action_space: str,
-    pose: Any,
-    gripper: Any,
+    pose: Pose,
+    gripper: ArrayLike,
     trocar: rcm.TrocarFrame,
     wrist: rcm.Wrist | None = None,
-    angles: Any = None,
+    angles: ArrayLike | None = None,
 ) -> jax.Array:
     """Encodes poses and grippers `[..., A]` as one vector `[..., A * (dim + 1)]`, unscaled.
 

@@ -1,18 +1,19 @@
 """Poses as rows of numbers outside of starjax: x y z in m, quaternion x y z w, gripper."""
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from starjax import rcm
 from starjax.core.errors import UsageError
 
 COLUMNS = 8  # for an arm
-ACTIONS = ("pose", "rcm4")  # columns of the actions
+# Numbers of an arm's action: a row, or the action of a space and the gripper.
+ACTIONS = {"pose": COLUMNS, "rcm4": rcm.ACTION_SPACES["rcm4"].dim + 1}
 _SHORTEST = 0.5  # norm of a quaternion: below, its direction is noise
 
 
-def pack(p: Any, R: Any, gripper: Any) -> np.ndarray:
+def pack(p: ArrayLike, R: ArrayLike, gripper: ArrayLike) -> np.ndarray:
     """Packs poses `[..., A]` to rows `[..., 8 A]`."""
     p, R, gripper = (np.asarray(x) for x in (p, R, gripper))
     xyzw = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat().reshape(*R.shape[:-2], 4)

@@ -14,6 +14,7 @@ from starjax.rcm.trocar import Trocar
 from starjax.rollouts import episodes, programs
 from starjax.runtime import jax_settings, xla
 from starjax.sim import registries
+from starjax.sim.scene import Scene
 from starjax.sim.state import Env
 from starjax.sim.task import Task
 
@@ -127,7 +128,7 @@ def trocars_of(records: Sequence[Mapping[str, Any]]) -> Trocar:
     return Trocar(*(np.array(row, np.float32) for row in rows))
 
 
-def model_hash(scene: Any) -> str:
+def model_hash(scene: Scene) -> str:
     """Identifies the compiled scene; empty where the environment has no MuJoCo model."""
     mj_model = getattr(scene, "mj_model", None)
     if mj_model is None:

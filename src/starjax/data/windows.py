@@ -15,6 +15,7 @@ import numpy as np
 from starjax import rcm
 from starjax.core.types import Command, Observation
 
+Array = jax.Array | np.ndarray
 _CHUNK = 1 << 13
 
 
@@ -61,7 +62,7 @@ class Batch:
 
 
 def split_holdout(
-    start: Any, length: Any, trocar: rcm.TrocarFrame, holdout: int
+    start: np.ndarray, length: np.ndarray, trocar: rcm.TrocarFrame, holdout: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Splits the frames into training and held-out ones, by whole demonstrations.
 
@@ -132,7 +133,7 @@ def padded_count(count: int) -> int:
     return -(-count // step) * step
 
 
-def window_frames(frame: Any, first: Any, last: Any, obs_horizon: int, horizon: int):
+def window_frames(frame: Array, first: Array, last: Array, obs_horizon: int, horizon: int):
     """Returns the frame numbers of each window; a demonstration's ends repeat.
 
     Args:
@@ -165,7 +166,9 @@ def control_steps(dataset: Dataset, frame: jax.Array) -> jax.Array:
     return frame - dataset.start[dataset.episode[frame]]
 
 
-def gather(dataset: Dataset, frame: Any, obs_horizon: int, horizon: int, seen: Any = None) -> Batch:
+def gather(
+    dataset: Dataset, frame: Array, obs_horizon: int, horizon: int, seen: Any = None
+) -> Batch:
     """Gathers the windows at frames `[...]`, as arrays of the dataset's kind (numpy or jax).
 
     `seen`, int32 `[..., O]`, are the control steps that are observed instead of the last O.

@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.typing import ArrayLike
 
 from starjax import rcm
 from starjax.core.errors import UsageError
@@ -54,7 +55,7 @@ class Client:
     def __init__(
         self,
         address: str,
-        trocar: Any,
+        trocar: rcm.Trocar | ArrayLike,
         *,
         key: jax.Array | None = None,
         api_key: str = "",
@@ -171,7 +172,9 @@ class Client:
         self.report.fault, self._is_silent = fault, True
         self._forget()
 
-    def restart(self, moment: RobotObservation, trocar: Any = None) -> None:
+    def restart(
+        self, moment: RobotObservation, trocar: rcm.Trocar | ArrayLike | None = None
+    ) -> None:
         """Begins anew from the measured pose, once a person has looked at the arm.
 
         Args:
@@ -223,7 +226,7 @@ class Client:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _place(self, trocar: Any) -> None:
+    def _place(self, trocar: rcm.Trocar | ArrayLike) -> None:
         spec = self.input_spec
         self._trocar = trocar_inputs.read(trocar, spec)
         p_world_trocar = rcm.trocar_position(self._trocar, spec.p_world_ref)

@@ -16,7 +16,9 @@ from starjax.deploy import wire
 
 _FIRST_WAIT_S, _MAX_WAIT_S = 0.05, 1.0  # between two attempts to connect; doubles
 _POLL_S = 0.05  # between two checks of an idle connection
-_MAX_REPLY = 1 << 24  # bytes of a server's frame
+MAX_REPLY = 1 << 24  # bytes of a server's frame
+# The resolver raises ValueError for impossible host names.
+FAULTS = (OSError, ValueError, websockets.WebSocketException)
 _SILENT = logging.getLogger("starjax.connection")
 _SILENT.addHandler(logging.NullHandler())
 _SILENT.propagate = False
@@ -55,8 +57,7 @@ class Connection:
         self.address = address if "://" in address else f"ws://{address}"
         self.metadata: dict[str, Any] = {}
         self.fault, self.connections = "no server at this address", 0
-        self._headers = {"Authorization": f"Api-Key {api_key}"} if api_key else {}
-        self._timeout_s = timeout_s
+        self._api_key, self._timeout_s = api_key, timeout_s
         self._requests: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
         self._up, self._closing = threading.Event(), threading.Event()
@@ -96,30 +97,18 @@ class Connection:
         wait_s = _FIRST_WAIT_S
         while not self._closing.is_set():
             try:
-                with self._open() as socket:
+                socket = connect(self.address, self._api_key, self._timeout_s)
+                with socket:
                     self._greet(socket.recv(self._timeout_s))
                     wait_s = _FIRST_WAIT_S
                     self._exchange(socket)
-            # The resolver raises ValueError for impossible host names.
-            except (OSError, ValueError, websockets.WebSocketException) as error:
+            except FAULTS as error:
                 self.fault = str(error) or type(error).__name__
             self._up.clear()
             self._closing.wait(wait_s)
             wait_s = min(2 * wait_s, _MAX_WAIT_S)
 
-    def _open(self) -> sockets.ClientConnection:
-        return sockets.connect(
-            self.address,
-            additional_headers=self._headers,
-            compression=None,
-            proxy=None,  # a control loop never passes through one of the environment
-            max_size=_MAX_REPLY,
-            open_timeout=self._timeout_s,
-            close_timeout=self._timeout_s,
-            logger=_SILENT,
-        )
-
-    def _greet(self, frame: Any) -> None:
+    def _greet(self, frame: str | bytes) -> None:
         metadata = wire.unpack(frame)
         if not isinstance(metadata, dict) or metadata.get("protocol") != wire.PROTOCOL:
             raise UsageError("address", f"a server of protocol {wire.PROTOCOL}", self.address)
@@ -132,7 +121,7 @@ class Connection:
             self._requests.get()
         self._up.set()
 
-    def _exchange(self, socket: Any) -> None:
+    def _exchange(self, socket: sockets.ClientConnection) -> None:
         """Exchanges requests and replies until the connection breaks, which is a reply too."""
         try:
             while (frame := self._next_request(socket)) is not None:
@@ -144,7 +133,7 @@ class Connection:
             self._replies.put(Reply(None, str(error) or "no answer in time", is_lost=True))
             raise
 
-    def _next_request(self, socket: Any) -> bytes | None:
+    def _next_request(self, socket: sockets.ClientConnection) -> bytes | None:
         """Waits for the next request, None at the end; raises if the connection breaks first."""
         while not self._closing.is_set():
             try:
@@ -155,7 +144,39 @@ class Connection:
         return None
 
 
-def _read(frame: Any) -> Reply:
+def connect(
+    address: str,
+    api_key: str,
+    timeout_s: float,
+    close_s: float | None = None,
+    ping_s: float | None = 20.0,
+) -> sockets.ClientConnection:
+    """Connects to a server.
+
+    Args:
+      address: `ws://HOST:PORT`.
+      api_key: of the server, may be empty.
+      timeout_s: of the connection.
+      close_s: of its end; by default the same.
+      ping_s: between two pings; None for none.
+
+    Raises:
+      FAULTS: no server answers, or it refuses the key.
+    """
+    return sockets.connect(
+        address,
+        additional_headers={"Authorization": f"Api-Key {api_key}"} if api_key else {},
+        compression=None,
+        proxy=None,  # a control loop never passes through one of the environment
+        max_size=MAX_REPLY,
+        open_timeout=timeout_s,
+        close_timeout=timeout_s if close_s is None else close_s,
+        ping_interval=ping_s,
+        logger=_SILENT,
+    )
+
+
+def _read(frame: str | bytes) -> Reply:
     if isinstance(frame, str):
         return Reply(None, frame)
     try:

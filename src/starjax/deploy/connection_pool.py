@@ -1,21 +1,15 @@
 """Connections to a server for programs that wait for its answers."""
 
-import logging
 import queue
 from typing import Any
 
-import websockets
 from websockets.sync import client as sockets
 
 from starjax.core.errors import UsageError
-from starjax.deploy import wire
+from starjax.deploy import connection, wire
 
 TIMEOUT_S = 120.0  # for an answer: a server may compile at the first request
 CONNECT_S = 10.0
-MAX_REPLY = 1 << 24  # bytes
-_SILENT = logging.getLogger("starjax.link")
-_SILENT.addHandler(logging.NullHandler())
-_SILENT.propagate = False
 
 
 class LostServer(UsageError):
@@ -36,8 +30,7 @@ class ConnectionPool:
         Raises:
           UsageError: no server answers, or it refuses the key.
         """
-        self.address, self._timeout_s = address, timeout_s
-        self._headers = {"Authorization": f"Api-Key {api_key}"} if api_key else {}
+        self.address, self._api_key, self._timeout_s = address, api_key, timeout_s
         self._sockets: queue.SimpleQueue[sockets.ClientConnection] = queue.SimpleQueue()
         self.metadata = self._open()
 
@@ -60,7 +53,7 @@ class ConnectionPool:
             reply = socket.recv(self._timeout_s)
         except TimeoutError:
             raise self._lost(f"none within {self._timeout_s:g} s") from None
-        except (OSError, websockets.WebSocketException) as error:
+        except connection.FAULTS as error:
             raise self._lost(str(error) or type(error).__name__) from None
         finally:
             self._sockets.put(socket)
@@ -80,20 +73,10 @@ class ConnectionPool:
     def _open(self) -> dict[str, Any]:
         """Adds a connection; returns its greeting."""
         try:
-            socket = sockets.connect(
-                self.address,
-                additional_headers=self._headers,
-                compression=None,
-                max_size=MAX_REPLY,
-                open_timeout=CONNECT_S,
-                close_timeout=1.0,
-                proxy=None,
-                ping_interval=None,  # openpi's server answers no ping while its policy computes
-                logger=_SILENT,
-            )
+            # openpi's server answers no ping while its policy computes
+            socket = connection.connect(self.address, self._api_key, CONNECT_S, 1.0, ping_s=None)
             metadata = wire.unpack(socket.recv(self._timeout_s))
-        # The resolver raises ValueError for impossible host names.
-        except (OSError, ValueError, websockets.WebSocketException) as error:
+        except connection.FAULTS as error:
             got = str(error) or type(error).__name__
             raise UsageError("--policy", f"a server at {self.address}", got) from None
         if not isinstance(metadata, dict):

@@ -8,6 +8,7 @@ import numpy as np
 
 from starjax.core import errors, sources
 from starjax.deploy import connection_pool, served
+from starjax.policies import in_env
 from starjax.policies.external import POLICIES, ExternalPolicy
 from starjax.runtime import user_code
 
@@ -58,7 +59,7 @@ class LocalConnection:
         return {"actions": np.asarray(actions)}
 
 
-def connect(name: str, arms: Sequence[str] = ()) -> served.ServedPolicy:
+def connect(name: str, arms: Sequence[str] = ()) -> in_env.PolicyInEnv:
     """Returns a policy of `POLICIES` in its environment, after one plan as a test.
 
     Args:

@@ -10,7 +10,7 @@ from starjax.core.errors import UsageError
 from starjax.data import pose_rows
 from starjax.deploy import wire
 from starjax.deploy.inputs import InputSpec
-from starjax.policies.monitor import calibrate
+from starjax.policies.monitor import record
 from starjax.sim import names
 from starjax.sim.task import CONTROL_HZ
 
@@ -95,7 +95,7 @@ def read_spec(metadata: dict[str, Any]) -> InputSpec:
         raise UsageError("address", "a server of starjax", f"another one: {error!r}") from None
 
 
-def read_monitor(metadata: dict[str, Any], execute: int) -> calibrate.Monitor | None:
+def read_monitor(metadata: dict[str, Any], execute: int) -> record.Monitor | None:
     """Reads the runtime monitor of a policy, None without one.
 
     Args:
@@ -108,7 +108,7 @@ def read_monitor(metadata: dict[str, Any], execute: int) -> calibrate.Monitor | 
     if "monitor" not in metadata:
         return None
     try:
-        monitor = calibrate.from_json(metadata["monitor"])
+        monitor = record.from_json(metadata["monitor"])
     except (AttributeError, TypeError, ValueError) as error:
         raise UsageError("greeting.monitor", "a runtime monitor", str(error)[:200]) from None
     if monitor.settings.execute != execute:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from jax.typing import ArrayLike
 
 from starjax.core.types import Pose
 
@@ -91,7 +92,7 @@ class Snapshot(NamedTuple):
 def check(
     snapshot: Snapshot,
     commands: Sequence[Pose],
-    p_world_trocar: Any,
+    p_world_trocar: ArrayLike,
     now: float,
     tolerances: Tolerances = TOLERANCES,
 ) -> list[Doubt]:
@@ -170,7 +171,7 @@ def check_first(command: Pose, setpoint: Pose, max_first: float = MAX_FIRST) -> 
     ]
 
 
-def off_trocar(shaft: Pose, p_world_trocar: Any) -> np.ndarray:
+def off_trocar(shaft: Pose, p_world_trocar: ArrayLike) -> np.ndarray:
     """Returns the distances `[...]` m from trocars `[..., 3]` to the axes of shafts."""
     R, p = (np.asarray(x, np.float64) for x in shaft)
     return np.linalg.norm(
@@ -178,7 +179,7 @@ def off_trocar(shaft: Pose, p_world_trocar: Any) -> np.ndarray:
     )
 
 
-def _distance(p: Any, other: Any) -> float:
+def _distance(p: ArrayLike, other: ArrayLike) -> float:
     return _most(np.linalg.norm(np.asarray(p, np.float64) - np.asarray(other, np.float64), axis=-1))
 
 

@@ -8,6 +8,9 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
+from jax.typing import ArrayLike
+
+from starjax import rcm
 from starjax.core.errors import UsageError
 from starjax.deploy import batching, server, wire
 from starjax.deploy.client import Client
@@ -20,7 +23,7 @@ from starjax.deploy.robot import Robot
 def drive(
     robot: Robot,
     policy: Deployed,
-    trocar: Any,
+    trocar: rcm.Trocar | ArrayLike,
     seconds: float,
     should_stop: Callable[[], bool] = lambda: False,
     **options: Any,

@@ -138,7 +138,7 @@ def check_trocar(spec: InputSpec, trocar: rcm.Trocar) -> None:
         trocar_region.check(spec.regions, reference, places)
 
 
-def trocar_position(trocar: rcm.Trocar, p_world_ref: Any) -> np.ndarray:
+def trocar_position(trocar: rcm.Trocar, p_world_ref: np.ndarray) -> np.ndarray:
     """Returns trocars `[*robots, *arms, 3]` m on the host, as `rcm.trocar_position`."""
     radius, polar, azimuth = (np.asarray(field, np.float64) for field in trocar)
     across = radius * np.sin(polar)
@@ -255,7 +255,7 @@ def check_off(off: float, max_off_trocar: float) -> None:
 
 @functools.partial(jax.jit, static_argnums=3)
 def _through(
-    pose: Pose, trocar: rcm.Trocar, p_world_ref: Any, leading: int
+    pose: Pose, trocar: rcm.Trocar, p_world_ref: np.ndarray, leading: int
 ) -> tuple[jax.Array, jax.Array]:
     """Measures tools `[*robots, O, *arms]` against trocars `[*robots, *arms]`.
 
@@ -269,7 +269,7 @@ def _through(
 
 @functools.partial(jax.jit, static_argnums=(0, 4))
 def _bend(
-    wrist: rcm.Wrist, pose: Pose, trocar: rcm.Trocar, p_world_ref: Any, leading: int
+    wrist: rcm.Wrist, pose: Pose, trocar: rcm.Trocar, p_world_ref: np.ndarray, leading: int
 ) -> jax.Array:
     """Returns the largest angle (rad) beyond the limits of tools `[*robots, O, *arms]`."""
     p_world_trocar = jnp.expand_dims(rcm.trocar_position(trocar, p_world_ref), leading)

@@ -20,7 +20,6 @@ from starjax.sim import env as sim_env
 from starjax.sim.task import Task
 
 MAX_HORIZON = 4096
-_WIDTH = {"pose": pose_rows.COLUMNS, "rcm4": rcm.ACTION_SPACES["rcm4"].dim + 1}  # for an arm
 
 
 def input_spec(env: sim_env.Env, settings: config.PolicyConfig) -> InputSpec:
@@ -78,7 +77,7 @@ def decode(
     """
     actions = value.get("actions") if isinstance(value, dict) else None
     arms = spec.arms[0] if spec.arms else 1
-    width = _WIDTH[action_space] * arms
+    width = pose_rows.ACTIONS[action_space] * arms
     if not isinstance(actions, np.ndarray) or actions.dtype.kind not in "fiu":
         raise UsageError("answer.actions", "an array of numbers", type(actions).__name__)
     if actions.ndim != 2 or actions.shape[1] != width or not 1 <= len(actions) <= MAX_HORIZON:

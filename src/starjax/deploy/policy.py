@@ -22,7 +22,7 @@ from starjax.deploy import approach, guard, inputs, random_keys
 from starjax.deploy.inputs import RobotObservation
 from starjax.policies import packaged, policy_file, sampling
 from starjax.policies import policy as policies
-from starjax.policies.monitor.calibrate import Monitor
+from starjax.policies.monitor.record import Monitor
 from starjax.rcm import arrays
 from starjax.runtime import files, precompile
 from starjax.sim import registries, trocar_region, wrists

@@ -23,6 +23,7 @@ class RemotePolicy:
     their twin. A refused plan holds the measured pose.
 
     Attributes:
+      origin: address and greeting, JSON values.
       refused: plans that the server refused or that were invalid.
       fault: the error that ended it, or None.
     """
@@ -34,11 +35,13 @@ class RemotePolicy:
         horizon: int,
         encode: Callable[..., dict[str, Any]],
         decode: Callable[[Any, rcm.Trocar], Command],
+        origin: dict[str, Any],
     ) -> None:
         self._link, self._spec, self.horizon = connections, spec, horizon
         self._encode, self._decode = encode, decode
         self._pool = ThreadPoolExecutor(greeting.MAX_CONNECTIONS, "starjax-remote")
-        self.refused, self.fault = 0, None
+        self.origin, self.refused = origin, 0
+        self.fault: Exception | None = None
 
     def sample(
         self, done: Any, stats: Any, keys: jax.Array, observation: Any, trocar: rcm.TrocarFrame

@@ -1,9 +1,8 @@
 """A served policy in the environment that it is evaluated in."""
 
-import contextlib
 import functools
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import numpy as np
@@ -13,10 +12,8 @@ from starjax.core import config, config_json
 from starjax.core.errors import UsageError
 from starjax.core.types import Command
 from starjax.deploy import batching, connection_pool, greeting, inputs, plain, remote_policy, wire
-from starjax.policies import in_env
+from starjax.policies import in_env, policy_file
 from starjax.policies.base import Policy
-from starjax.policies.monitor.calibrate import Monitor
-from starjax.rollouts import agent
 from starjax.sim import env as sim_env
 from starjax.sim import wrists
 from starjax.sim.task import Task
@@ -24,77 +21,12 @@ from starjax.sim.task import Task
 _NEAR_M = 1e-3  # between nominal trocars of server and task
 
 
-class ServedTraining(NamedTuple):
-    """The fields of `policy_file.Trained` that evaluations read."""
-
-    method: str
-    policy: config.PolicyConfig
-    params: Any
-    normalizer: None
-    scene: Any
-    train: config.TrainConfig = config.TrainConfig()
-    demos: None = None
-    preset: None = None
-    monitor: Monitor | None = None
-
-
-class ServedPolicy(NamedTuple):
-    """A served policy in its environment, in place of `in_env.PolicyInEnv`.
-
-    Attributes:
-      trained: its settings.
-      policy: `sample` of the server.
-      env: environment with its observation.
-      weights: SHA-256 that identifies it: the digest of its greeting, or that of the greeting.
-      origin: address and greeting, JSON values.
-      remote: the server.
-    """
-
-    trained: ServedTraining
-    policy: Policy
-    env: sim_env.Env
-    weights: str
-    origin: dict[str, Any]
-    remote: remote_policy.RemotePolicy
-
-    def agent(self, average_plans: bool = False) -> agent.BatchAgent:
-        """Returns the agent of a batch of episodes."""
-        trained = self.trained
-        return _agent(trained.method, self.policy, trained.policy, average_plans)
-
-    @contextlib.contextmanager
-    def faults(self) -> Iterator[None]:
-        """Raises the server's fault in place of jax's error of a failed callback."""
-        try:
-            yield
-        except jax.errors.JaxRuntimeError:
-            if self.remote.fault is None:
-                raise
-            raise self.remote.fault from None
-
-
-@functools.lru_cache(maxsize=4)
-def _agent(
-    method: str, policy: Policy, settings: config.PolicyConfig, average_plans: bool
-) -> agent.BatchAgent:
-    """Returns the agent of a policy whose first parameter is the episodes that are over."""
-    base = in_env.batch_agent(method, policy, settings, average_plans)
-
-    def init(params: Any, keys: jax.Array, state: Any, observe: agent.Observe) -> Any:
-        return base.init((state.done, None), keys, state, observe)
-
-    def act(params: Any, memory: Any, state: Any, observe: agent.Observe, t: jax.Array) -> Any:
-        return base.act((state.done, None), memory, state, observe, t)
-
-    return agent.BatchAgent(init, act, base.about)
-
-
 def connect(
     address: str,
     api_key: str = "",
     arms: Sequence[str] = (),
     timeout_s: float = connection_pool.TIMEOUT_S,
-) -> ServedPolicy:
+) -> in_env.PolicyInEnv:
     """Connects to a server and requests one plan as a test.
 
     Args:
@@ -109,7 +41,7 @@ def connect(
     return attach(connection_pool.ConnectionPool(address, api_key, timeout_s), arms)
 
 
-def attach(connections: Any, arms: Sequence[str] = ()) -> ServedPolicy:
+def attach(connections: Any, arms: Sequence[str] = ()) -> in_env.PolicyInEnv:
     """Returns the policy behind connections, see `connect`, after one plan as a test."""
     hello = greeting.read(connections.metadata)
     connections.widen(hello.batch)
@@ -126,7 +58,8 @@ def attach(connections: Any, arms: Sequence[str] = ()) -> ServedPolicy:
     example = batching.example(spec)
     first = decode(_first_answer(connections, encode, example), example.trocar)
     horizon = len(first.gripper)
-    remote = remote_policy.RemotePolicy(connections, spec, horizon, encode, decode)
+    origin = {"address": connections.address, "metadata": greeting.as_json(connections.metadata)}
+    remote = remote_policy.RemotePolicy(connections, spec, horizon, encode, decode, origin)
     remote.check(first)
     execute = hello.execute or horizon
     if not settings.obs_horizon - 1 <= execute <= horizon:
@@ -135,17 +68,21 @@ def attach(connections: Any, arms: Sequence[str] = ()) -> ServedPolicy:
         config.PolicyConfig,
         {**config_json.as_json(settings), "horizon": horizon, "execute": execute},
     )
-    origin = {"address": connections.address, "metadata": greeting.as_json(connections.metadata)}
-    trained = ServedTraining(
-        hello.method,
-        settings,
-        np.zeros(1, bool),
-        None,
-        env.names,
+    params: Any = np.zeros(1, bool)
+    unknown: Any = None
+    trained = policy_file.Trained(
+        method=hello.method,
+        policy=settings,
+        train=config.TrainConfig(),
+        params=params,
+        normalizer=unknown,
+        scene=env.names,
+        p_world_ref=None,
+        roll_zero=(),
         monitor=greeting.read_monitor(connections.metadata, execute),
     )
     policy = _policy(remote, env.task)
-    return ServedPolicy(trained, policy, env, greeting.identity(origin), origin, remote)
+    return in_env.PolicyInEnv(trained, policy, env, greeting.identity(origin), remote)
 
 
 def _policy(remote: remote_policy.RemotePolicy, task: Task) -> Policy:

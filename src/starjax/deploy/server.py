@@ -23,7 +23,7 @@ import starjax
 from starjax.core.errors import UsageError
 from starjax.deploy import batching, client_log, requests, wire
 from starjax.deploy.policy import Deployed
-from starjax.policies.monitor import calibrate
+from starjax.policies.monitor import record
 from starjax.runtime import connections
 from starjax.sim.task import CONTROL_HZ
 
@@ -124,7 +124,7 @@ def metadata(policy: Deployed, name: str = "", batch: int = 1) -> dict[str, Any]
         "asks": {name: value for name, value in _plain(spec).items() if name != "wrist" or value},
         "inputs": {field: _plain(row) for field, row in arrays},
         "actions": list(wire.ACTION),
-        **({"monitor": calibrate.to_json(policy.monitor)} if policy.monitor else {}),
+        **({"monitor": record.to_json(policy.monitor)} if policy.monitor else {}),
     }
 
 

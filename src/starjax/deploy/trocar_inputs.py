@@ -1,15 +1,14 @@
 """Measured trocars, as the owner of a robot writes them."""
 
-from typing import Any
-
 import numpy as np
+from jax.typing import ArrayLike
 
 from starjax import rcm
 from starjax.core.errors import UsageError
 from starjax.deploy.inputs import InputSpec, check_trocar
 
 
-def read(trocar: Any, spec: InputSpec) -> rcm.Trocar:
+def read(trocar: rcm.Trocar | ArrayLike, spec: InputSpec) -> rcm.Trocar:
     """Returns trocars of all arms, given as parameters or as positions `[*arms, 3]` m."""
     arms = spec.arms
     if not isinstance(trocar, rcm.Trocar):

@@ -87,7 +87,7 @@ def of_episodes(made: mdp.Episodes, lanes: int) -> EpisodeBatch:
     reset, step, judge = jax.vmap(made.reset), jax.vmap(made.step), jax.vmap(made.judge)
     look = jax.vmap(lambda state: (made.observe(state), made.measure(state)))
 
-    def advance(lanes: Lanes, action: Any, do: StepMode) -> tuple[Lanes, BatchStep]:
+    def advance(lanes: Lanes, action: jax.Array, do: StepMode) -> tuple[Lanes, BatchStep]:
         before, reset_mask = lanes.state, do.reset_mask
         moves = do.move & ~jnp.all(reset_mask)
         after = jax.lax.cond(moves, lambda: step(before, action), lambda: before)
@@ -129,10 +129,10 @@ def seeded(lanes: Lanes, seeds: Any, which: Any) -> Lanes:
     return _merged(which, fresh, lanes)
 
 
-def _merged(which: Any, a: Any, b: Any) -> Any:
+def _merged(which: jax.Array, a: Any, b: Any) -> Any:
     """Leaves `[N, ...]` of `a` where `which` `[N]`, else of `b`."""
     return jax.tree.map(lambda x, y: _where(which, x, y), a, b)
 
 
-def _where(which: Any, a: Any, b: Any) -> jax.Array:
+def _where(which: jax.Array, a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.where(jnp.reshape(which, (-1,) + (1,) * (jnp.ndim(b) - 1)), a, b)

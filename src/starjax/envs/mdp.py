@@ -31,6 +31,7 @@ from starjax.envs.settings import EnvSettings
 
 if TYPE_CHECKING:  # it needs the extra sim, which `make` requires
     from starjax.sim.state import EnvState
+    from starjax.sim.task import Task
 
 SHARE = 0.1  # part of half an action's range, in a control step: of a tip 0.15 m/s, as the arms can
 
@@ -50,9 +51,9 @@ class Episodes(NamedTuple):
       reset: key -> EnvState.
       step: (EnvState, action `[D]`) -> EnvState.
       judge: (EnvState before, EnvState after) -> Outcome.
-      observe: EnvState -> observation, see `observing`.
-      measure: EnvState -> name -> number, for `info`.
-      camera: EnvState -> `[h, w, 3]` uint8 of the first camera.
+      observe: "EnvState" -> observation, see `observing`.
+      measure: "EnvState" -> name -> number, for `info`.
+      camera: "EnvState" -> `[h, w, 3]` uint8 of the first camera.
       decode: (EnvState, action `[D]`) -> Command `[A]`.
       encode: (EnvState, Command `[A]`) -> action `[D]`, not clipped.
       action_size: D.
@@ -160,7 +161,7 @@ def make(settings: EnvSettings) -> Episodes:
     )
 
 
-def _space(settings: EnvSettings, task: Any) -> rcm.ActionSpace:
+def _space(settings: EnvSettings, task: "Task") -> rcm.ActionSpace:
     """Returns the action space of the settings for a task with its tools.
 
     Raises:

@@ -20,13 +20,14 @@ import numpy as np
 from starjax.envs import ranges
 from starjax.policies import features
 from starjax.sim import control
+from starjax.sim.state import Env, EnvState
 from starjax.sim.task import Task
 
 LARGEST = 10.0  # numbers are clipped here
 _FASTEST = np.array([control.MAX_SPEED] * 3 + [control.MAX_SPIN], np.float32)
 
 
-def make(env: Any, scaled: Callable[[Any], jax.Array]) -> Callable[[Any], Any]:
+def make(env: Env, scaled: Callable[[Any], jax.Array]) -> Callable[[Any], Any]:
     """Makes EnvState -> `[O]` float32 or `{camera's name: [h, w, 3] uint8, "tool": [O] float32}`.
 
     Args:
@@ -36,16 +37,17 @@ def make(env: Any, scaled: Callable[[Any], jax.Array]) -> Callable[[Any], Any]:
     task: Task = env.task
     low, high = (end[0] for end in ranges.tips(task))
 
-    def tool(state: Any) -> jax.Array:
+    def tool(state: EnvState) -> jax.Array:
         speed = state.velocity[:, :4] / _FASTEST
         trocar = features.trocar_features(state.measured_trocar.trocar)
         parts = [scaled(state), speed.ravel(), trocar.ravel()]
         return jnp.concatenate(parts)
 
-    def observe(state: Any) -> Any:
+    def observe(state: EnvState) -> Any:
         observation = env.observe(state)
         if observation.images is not None:
             return {**observation.images, "tool": _clipped(tool(state))}
+        assert observation.state is not None
         parts, at = [tool(state)], 0
         for field in task.fields:
             part = observation.state[at : at + field.size]

@@ -1,7 +1,5 @@
 """Ranges that actions in [-1, 1] span in a task's action space."""
 
-from typing import Any
-
 import jax
 import numpy as np
 
@@ -57,7 +55,7 @@ def actions(task: Task, space: rcm.ActionSpace) -> tuple[np.ndarray, np.ndarray]
     return low, high
 
 
-def _widen(space: rcm.ActionSpace, low: np.ndarray, high: np.ndarray, wrist: Any) -> None:
+def _widen(space: rcm.ActionSpace, low: np.ndarray, high: np.ndarray, wrist: rcm.Wrist) -> None:
     """Widens the bounds `[dim]` of straight tools, in place, to those of a wrist."""
     most = {
         "R": 1.0,

@@ -18,7 +18,7 @@ import numpy as np
 
 from starjax.evaluation import statistics
 from starjax.evaluation import trials as tables
-from starjax.policies.monitor import calibrate, scores
+from starjax.policies.monitor import record, scores
 from starjax.rollouts import plans
 from starjax.rollouts.episodes import Episode
 
@@ -40,10 +40,10 @@ def of_episodes(
     return found
 
 
-def compose(table: tables.Table, monitor: calibrate.Monitor) -> dict[str, Any]:
+def compose(table: tables.Table, monitor: record.Monitor) -> dict[str, Any]:
     """Returns the figures documented at the top of this file, from a table with scores."""
     assert table.scores is not None
-    times, score = calibrate.first_alarms(monitor, table.scores)
+    times, score = record.first_alarms(monitor, table.scores)
     is_raised, is_failure = np.isfinite(times), ~table.success
     raised = is_raised & is_failure
     return {

@@ -72,6 +72,21 @@ class _Rate(msgspec.Struct, kw_only=True):
     ci95: list[float] | None = None
 
 
+class LevelScores(msgspec.Struct):
+    """Scores at a level of a disturbance."""
+
+    strict: _Rate
+    rcm_error_mm: dict[str, dict[str, float | None]]
+    wall_force_N: dict[str, float | None] = {}
+
+
+class DisturbanceScores(msgspec.Struct):
+    """Scores at all levels of a disturbance."""
+
+    unit: str
+    levels: dict[str, LevelScores]
+
+
 class _Split(msgspec.Struct):
     seen: _Rate
     unseen: _Rate
@@ -134,7 +149,9 @@ class Hardware(msgspec.Struct):
     memory_gb: float | None = None
 
 
-class _Scene(msgspec.Struct):
+class ResultScene(msgspec.Struct):
+    """Names of a scene's parts."""
+
     task: str
     arms: tuple[str, ...]
     tools: tuple[str, ...]
@@ -144,7 +161,7 @@ class _Scene(msgspec.Struct):
 class _Content(msgspec.Struct, kw_only=True):
     """Fields of evaluations and sweeps alike, documented at `result.Result`."""
 
-    scene: _Scene
+    scene: ResultScene
     method: str
     observation: str
     control_hz: float

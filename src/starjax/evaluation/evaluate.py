@@ -33,6 +33,7 @@ from starjax.rollouts.agent import BatchAgent
 from starjax.rollouts.placement import DEFAULT_LAYOUT, DeviceLayout
 from starjax.runtime import files, jax_settings, xla
 from starjax.sim import endoscope_camera, registries
+from starjax.sim.state import Env
 
 # Trials together on a GPU, which takes hundreds in the time of one, as far as its memory goes.
 GPU_LANES, SMALL_GPU_LANES, SMALL_GPU_BYTES = 1280, 128, 40 << 30
@@ -62,7 +63,7 @@ class EvaluationSettings(NamedTuple):
 
 def evaluate(
     directory: Path,
-    env: Any,
+    env: Env,
     agent: BatchAgent,
     params: Any,
     trocars: Trocar,
@@ -151,7 +152,7 @@ def evaluate(
 
 
 def precompile(
-    env: Any, agent: BatchAgent, params: Any, trocars: Trocar, settings: EvaluationSettings
+    env: Env, agent: BatchAgent, params: Any, trocars: Trocar, settings: EvaluationSettings
 ) -> None:
     """Compiles, in the background, the programs that `evaluate` runs on one device.
 
@@ -194,7 +195,7 @@ def fingerprint(tree: Any) -> str:
     return digest.hexdigest()
 
 
-def _max_steps(env: Any, settings: EvaluationSettings) -> int:
+def _max_steps(env: Env, settings: EvaluationSettings) -> int:
     return math.ceil(settings.time_limit_s * env.control_hz - 1e-6)
 
 
@@ -242,7 +243,7 @@ def _resume(
 
 def _parts(
     directory: Path,
-    env: Any,
+    env: Env,
     run: Callable[..., Generator[engine.Progress]],
     group: list[episodes.Trial],
     spans: list[slice],

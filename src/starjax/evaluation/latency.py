@@ -12,9 +12,11 @@ import numpy as np
 from starjax import rcm
 from starjax.core import config, methods
 from starjax.core.types import Observation
+from starjax.data import normalizer
 from starjax.policies import features, generator
 from starjax.policies import policy as policies
 from starjax.policies.models import roll_net
+from starjax.policies.sequences import Params
 from starjax.runtime import precompile as precompile_lib
 from starjax.sim import wrists
 from starjax.sim.task import Field
@@ -25,8 +27,8 @@ _WARM_UP = 3  # calls before the clock starts
 def policy_ms(
     policy: policies.Policy,
     policy_config: config.PolicyConfig,
-    params: Any,
-    stats: Any,
+    params: Params,
+    stats: normalizer.Normalizer,
     sensors: features.Sensors,
     *,
     batch: int = 1,
@@ -63,8 +65,8 @@ def policy_ms(
 def precompile(
     policy: policies.Policy,
     policy_config: config.PolicyConfig,
-    params: Any,
-    stats: Any,
+    params: Params,
+    stats: normalizer.Normalizer,
     sensors: features.Sensors,
 ) -> None:
     """Compiles, in the background, the program that `policy_ms` times at batch 1.
@@ -78,8 +80,8 @@ def precompile(
 def table(
     method: methods.Method,
     policy_config: config.PolicyConfig,
-    params: Any,
-    stats: Any,
+    params: Params,
+    stats: normalizer.Normalizer,
     sensors: features.Sensors,
     *,
     ddim_steps: Sequence[int],

@@ -58,7 +58,7 @@ def make(
             reach=reach,
         )
 
-    def cast_params(params: Any) -> Any:
+    def cast_params(params: Params) -> Any:
         return sequences.cast_params(params, _MATRICES, unet.dtype)
 
     def prepare_for_inference(params: Params) -> Params:

@@ -5,45 +5,21 @@ with that arm's path, trocar and measured rolls. With a wrist it predicts roll, 
 turns N of an action.
 """
 
-from typing import Any, NamedTuple
-
 import jax
 import jax.numpy as jnp
 
 from starjax import rcm
 from starjax.core import config, methods
-from starjax.data import normalizer, windows
+from starjax.data import normalizer
 from starjax.policies import execution, features, generator, hierarchy, path_network
-from starjax.policies.base import Params, Policy
-from starjax.policies.models import kernels
+from starjax.policies.base import Policy
+from starjax.policies.hierarchy import by_arm
 
 # Noise on the roll network's inputs (standard deviation, normalised units): demonstrated positions
 # and rolls are exact, sampled and measured ones are not. It keeps small errors from accumulating,
 # and the network from copying the last measured roll.
 POSITION_NOISE = 0.02
 ROLL_NOISE = 0.05
-
-
-class PreparedHierarchy(NamedTuple):
-    """A batch as the networks learn from it.
-
-    Attributes:
-      inputs: observations.
-      trocar_condition: `[B, E]` trocar features of the position model; E = 0 by default.
-      model_inputs: prepared inputs of the position model's loss.
-      p: `[B, H, A, 3]` demonstrated positions with noise, for the roll network.
-      trocar: `[B, A, 7]` features.
-      history: `[B, O, A, N]` measured turns with noise.
-      roll: `[B, H, A, N]` demonstrated ones.
-    """
-
-    inputs: features.Inputs
-    trocar_condition: jax.Array
-    model_inputs: Any
-    p: jax.Array
-    trocar: jax.Array
-    history: jax.Array
-    roll: jax.Array
 
 
 def make(
@@ -61,98 +37,46 @@ def make(
         )
     arms, position, turns = sensors.task.arms, space.slices["p"], slice(space.slices["p"].start)
     outputs = turns.stop  # N: the position is the last part
-    dim = 4 * arms  # size of what is generated, see `generated`
+    dim = 4 * arms  # size of what is generated, see `extract`
     networks = generator.make(method, policy_config, sensors, dim)
-    model = networks.model
     observed = generator.sizes(policy_config, sensors, dim).observed
     rolls = path_network.make(policy_config, arms, observed, history=outputs, outputs=outputs)
 
-    def init(key: jax.Array) -> Params:
-        key_model, key_roll = jax.random.split(key)
-        return {**networks.init(key_model), "roll": rolls.init(key_roll)}
-
-    def prepare(
-        stats: normalizer.Normalizer, key: jax.Array, batch: windows.Batch
-    ) -> PreparedHierarchy:
-        key_inputs, key_model, key_p, key_roll = jax.random.split(key, 4)
-        action = features.encode_commands(stats, method.action_space, batch, wrist)
-        measured = _measured(stats, batch.observation, batch.trocar)
-        inputs = features.training_inputs(
-            policy_config,
-            train_config,
-            sensors,
-            stats,
-            key_inputs,
-            batch.observation,
-            generated(measured),
-        )
-        wanted = by_arm(action)
+    def lesson(
+        key_p: jax.Array, key_roll: jax.Array, action: jax.Array, measured: jax.Array
+    ) -> hierarchy.Lesson:
+        wanted = by_arm(action, arms)
         # [B, H, A, 3], [B, O, A, N]
-        p, history = wanted[..., position], by_arm(measured)[..., turns]
-        return PreparedHierarchy(
-            inputs=inputs,
-            trocar_condition=features.trocar_condition(method, batch.trocar),
-            model_inputs=model.prepare(key_model, generated(action)),  # a_0 = [p_abs, g], no roll
-            p=p + POSITION_NOISE * jax.random.normal(key_p, p.shape),
-            trocar=features.trocar_features(batch.trocar.trocar),
+        p, history = wanted[..., position], by_arm(measured, arms)[..., turns]
+        return hierarchy.Lesson(
+            path=p + POSITION_NOISE * jax.random.normal(key_p, p.shape),
             history=history + ROLL_NOISE * jax.random.normal(key_roll, history.shape),
-            roll=wanted[..., turns],
+            target=wanted[..., turns],
         )
 
-    def loss(params: Params, prepared: PreparedHierarchy) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Returns position loss + lambda * roll loss (Eq. 15)."""
-        condition = networks.observe(params, prepared.inputs, prepared.trocar_condition)
-        position_loss, metrics = model.loss(params["learner"], condition, prepared.model_inputs)
-        path = prepared.p, prepared.trocar, prepared.history  # x_rel (Eq. 13)
-        predicted = rolls.along(params["roll"], *path, condition)
-        # The roll's loss reads demonstrated positions: none of its gradient reaches the position
-        # model, which therefore cannot learn the trocar.
-        roll_loss = jnp.mean((prepared.roll - predicted) ** 2)  # Eq. 14
-        # L = L_abs + lambda L_rel
-        total = position_loss + policy_config.roll_loss_weight * roll_loss
-        return total, {"position_loss": position_loss, "roll_loss": roll_loss, **metrics}
-
-    def _decoded(params, stats, x0, measured, condition, trocar):
+    def decode(params, stats, x0, measured, condition, trocar):
         # 1. positions and grippers come from the model (Eq. 12)
-        p, gripper = jnp.split(by_arm(x0), [3], axis=-1)
+        p, gripper = jnp.split(by_arm(x0, arms), [3], axis=-1)
         # 2. turns along the sampled path (Eq. 13), clipped to the demonstrated range
         about = features.trocar_features(trocar.trocar)
-        gamma = rolls.along(params["roll"], p, about, by_arm(measured)[..., turns], condition)
+        history = by_arm(measured, arms)[..., turns]
+        gamma = rolls.along(params["roll"], p, about, history, condition)
         gamma = jnp.clip(gamma, -1.0, 1.0)  # an MLP extrapolates
         # 3. action vector in the order of the space, decoded on the RCM manifold (Alg. 1)
         action = jnp.concatenate([gamma, p, gripper], axis=-1)
         action = action.reshape(*x0.shape[:-1], -1)
         return execution.command(method, stats, action, trocar, wrist)
 
-    def by_arm(vector: jax.Array) -> jax.Array:
-        """Splits `[..., A * n]` by arm into `[..., A, n]`."""
-        return vector.reshape(*vector.shape[:-1], arms, -1)
-
-    def generated(vector: jax.Array) -> jax.Array:
+    def extract(vector: jax.Array) -> jax.Array:
         """Extracts positions and grippers `[..., A * 4]` from actions `[..., A * (dim + 1)]`."""
-        parts = by_arm(vector)
+        parts = by_arm(vector, arms)
         kept = jnp.concatenate([parts[..., position], parts[..., -1:]], axis=-1)
         return kept.reshape(*vector.shape[:-1], -1)
 
-    def _measured(stats, observation, trocar):
-        space = method.action_space
-        return features.encode_proprioception(stats, space, observation, trocar, wrist)
-
-    def prepare_for_inference(params: Params) -> Params:
-        return {**networks.prepare_for_inference(params), "roll": kernels.packed(params["roll"])}
-
-    metrics = ("position_loss", "roll_loss", *model.metrics)
-    acting = hierarchy.make(
-        method, policy_config, sensors, networks, _measured, generated, _decoded
-    )
-    return Policy(
-        init,
-        prepare,
-        loss,
-        acting.sample,
-        metrics,
-        networks.cast_params,
-        prepare_for_inference,
-        acting.generate,
-        acting.execute,
+    return hierarchy.make(
+        *(method, policy_config, sensors, train_config, wrist, networks),
+        generated="position",
+        small=hierarchy.SmallNetwork("roll", rolls, lesson),
+        decode=decode,
+        extract=extract,
     )

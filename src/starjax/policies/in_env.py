@@ -1,9 +1,12 @@
-"""A trained policy in the environment that it acts in: a file of weights to a batch agent."""
+"""A policy in the environment that it acts in: a file of weights, or a server, to a batch agent."""
 
+import contextlib
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
+
+import jax
 
 from starjax import rcm
 from starjax.core import config, errors, methods
@@ -13,10 +16,25 @@ from starjax.policies import policy_file
 from starjax.rollouts import agent, ensemble
 from starjax.runtime import files
 from starjax.sim import env as sim_env
+from starjax.sim.state import EnvState
+
+
+class Server(Protocol):
+    """A program that plans in the place of networks.
+
+    Attributes:
+      origin: address and greeting, JSON values.
+      refused: plans that it refused or that were invalid.
+      fault: the error that ended it, or None.
+    """
+
+    origin: dict[str, Any]
+    refused: int
+    fault: Exception | None
 
 
 class PolicyInEnv(NamedTuple):
-    """A trained policy in its environment.
+    """A policy in its environment.
 
     Apart from `policy_file.Trained`, the content of a file, because most users of a file (inspect,
     pack, deployment) build no simulator.
@@ -26,19 +44,34 @@ class PolicyInEnv(NamedTuple):
         is the method that runs, which may share the weights of another.
       policy: pure functions of the networks.
       env: environment with the observation of the training.
-      weights: SHA-256 of the file.
+      weights: SHA-256 of the file, or of a server's policy.
+      server: plans in the place of `trained.params`, which then are empty.
     """
 
     trained: policy_file.Trained
     policy: policies.Policy
     env: sim_env.Env
     weights: str
+    server: Server | None = None
 
     def agent(self, average_plans: bool = False) -> agent.BatchAgent:
         """Returns the agent of a batch of episodes; see `batch_agent`."""
         trained = self.trained
-        wrist = normalizer.wrist_of(methods.METHODS[trained.method], self.env.task)
-        return batch_agent(trained.method, self.policy, trained.policy, average_plans, wrist)
+        wrist = normalizer.wrist_of(methods.SCORED[trained.method], self.env.task)
+        made = batch_agent(trained.method, self.policy, trained.policy, average_plans, wrist)
+        if self.server is None:
+            return made
+        return agent.BatchAgent(*_asking_for_running(made.init, made.act), made.about)
+
+    @contextlib.contextmanager
+    def faults(self) -> Iterator[None]:
+        """Raises the server's fault in place of jax's error of a failed callback."""
+        try:
+            yield
+        except jax.errors.JaxRuntimeError:
+            if self.server is None or self.server.fault is None:
+                raise
+            raise self.server.fault from None
 
 
 @functools.lru_cache(maxsize=4)  # programs belong to the functions that they were made of
@@ -62,6 +95,21 @@ def batch_agent(
         keeps = normalizer.keeps_to_manifold(methods.SCORED[method])
         return ensemble.from_policy(policy.sample, settings.obs_horizon, keeps, wrist)
     return agent.from_policy(policy.sample, settings.obs_horizon, settings.execute)
+
+
+@functools.lru_cache(maxsize=4)
+def _asking_for_running(
+    begin: Callable[..., Any], decide: Callable[..., Any]
+) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """Returns an agent's functions with the episodes that are over as their first parameter."""
+
+    def init(params: Any, keys: jax.Array, state: EnvState, observe: agent.Observe) -> Any:
+        return begin((state.done, None), keys, state, observe)
+
+    def act(params: Any, memory: Any, state: EnvState, observe: agent.Observe, t: jax.Array) -> Any:
+        return decide((state.done, None), memory, state, observe, t)
+
+    return init, act
 
 
 def read(file: Path, argument: str = "--policy", hint: str = "") -> policy_file.Trained:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from starjax.core import config
 from starjax.policies import features, sequences
 from starjax.policies.models import kernels, roll_net
+from starjax.policies.sequences import Params
 
 
 class PathNetwork(NamedTuple):
@@ -59,7 +60,7 @@ def make(
         return network.init(key, p, trocar, past, more)
 
     def along(
-        params: Any,
+        params: Params,
         path: jax.Array,
         trocar: jax.Array,
         history: jax.Array,

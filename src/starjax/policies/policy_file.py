@@ -19,7 +19,7 @@ import safetensors.numpy
 from starjax.core import config, config_json
 from starjax.data import normalizer
 from starjax.policies.base import Params
-from starjax.policies.monitor import calibrate
+from starjax.policies.monitor import record
 from starjax.runtime import files
 from starjax.sim import names
 
@@ -40,7 +40,7 @@ class Trained(NamedTuple):
       params: the averaged (EMA) parameters.
       normalizer: fitted to the training demonstrations.
       scene: names of its task, arms and tools, and of the cameras in the order that it reads them.
-      p_world_ref: `[A][3]` m, each arm's nominal trocar, None in old files that do not say it.
+      p_world_ref: `[A][3]` m, each arm's nominal trocar, None if unknown.
       roll_zero: `[A]` rad, see `rcm.TrocarFrame`.
       demos: settings of its demonstrations, if known; they name the seen trocars.
       preset: the preset of its run, if it was given; for the record.
@@ -59,7 +59,7 @@ class Trained(NamedTuple):
     demos: config.DemosConfig | None = None
     preset: str | None = None
     packages: Mapping[str, str] = types.MappingProxyType({})
-    monitor: calibrate.Monitor | None = None
+    monitor: record.Monitor | None = None
 
 
 def save(path: pathlib.Path | str, trained: Trained, half: bool = False) -> None:
@@ -101,7 +101,7 @@ def save(path: pathlib.Path | str, trained: Trained, half: bool = False) -> None
     }
     if trained.monitor is not None:
         _check_monitor(trained, pathlib.Path(path))
-        values = calibrate.to_json(trained.monitor)
+        values = record.to_json(trained.monitor)
         parts = {name: values.pop(name) for name in _MONITOR_ARRAYS}
         arrays |= dict(_flatten({_MONITOR: parts}))
         about[_MONITOR] = values
@@ -204,22 +204,22 @@ def monitor_path(path: pathlib.Path) -> pathlib.Path:
     return path.with_suffix(".monitor.json")
 
 
-def _separate_monitor(path: pathlib.Path) -> calibrate.Monitor | None:
+def _separate_monitor(path: pathlib.Path) -> record.Monitor | None:
     file = monitor_path(path)
     if not file.exists():
         return None
     values = files.read_json(file)
     try:
-        return calibrate.from_json(values)
+        return record.from_json(values)
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from error
 
 
-def _monitor(about: dict[str, Any], arrays: dict[str, np.ndarray]) -> calibrate.Monitor | None:
+def _monitor(about: dict[str, Any], arrays: dict[str, np.ndarray]) -> record.Monitor | None:
     if _MONITOR not in about:
         return None
     parts = {name: arrays[f"{_MONITOR}{_SEPARATOR}{name}"] for name in _MONITOR_ARRAYS}
-    return calibrate.from_json({**about[_MONITOR], **parts})
+    return record.from_json({**about[_MONITOR], **parts})
 
 
 def _trained(about: dict[str, Any], tree: dict[str, Any]) -> Trained:
@@ -248,7 +248,7 @@ def _floats(values: Any) -> Any:
     return None if values is None else np.asarray(values, np.float64).tolist()
 
 
-def _flatten(tree: Any, prefix: str = ""):
+def _flatten(tree: Params, prefix: str = ""):
     """Yields (path, numpy array) for every leaf of nested dicts."""
     for name in sorted(tree):
         value, path = tree[name], f"{prefix}{name}"

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 
 Params = dict[str, Any]
 
@@ -98,7 +99,7 @@ def condition_vector(condition: Condition) -> jax.Array:
     )
 
 
-def cast_params(params: Any, names: set[str], dtype: Any) -> Any:
+def cast_params(params: Params, names: set[str], dtype: DTypeLike) -> Any:
     """Casts the leaves of these names to another dtype.
 
     Networks cast them anyway, to the same numbers. Casting once avoids reading float32 at each of

@@ -6,11 +6,9 @@ import jax
 
 from starjax import rcm
 from starjax.core import config, methods
-from starjax.core.types import Command, Observation
 from starjax.data import normalizer, windows
-from starjax.policies import execution, features, generator, sequences
+from starjax.policies import acting, execution, features, generator
 from starjax.policies.base import Params, Policy
-from starjax.policies.models.diffusion import within
 
 
 class PreparedActions(NamedTuple):
@@ -45,7 +43,9 @@ def make(
             stats,
             key_inputs,
             batch.observation,
-            _proprioception(stats, batch.observation, batch.trocar),
+            features.encode_proprioception(
+                stats, method.action_space, batch.observation, batch.trocar, wrist
+            ),
         )
         trocar_condition = features.trocar_condition(method, batch.trocar)
         return PreparedActions(inputs, trocar_condition, model.prepare(key_model, x0))
@@ -54,44 +54,18 @@ def make(
         condition = networks.observe(params, prepared.inputs, prepared.trocar_condition)
         return model.loss(params["learner"], condition, prepared.model_inputs)
 
-    def sample(
-        params: Params,
-        stats: normalizer.Normalizer,
-        keys: jax.Array,
-        observation: Observation,
-        trocar: rcm.TrocarFrame,
-    ) -> Command:
-        condition = _condition(params, stats, observation, trocar)
-        action = model.sample(params["learner"], keys, condition, stats.action.reach)
-        return execution.command(method, stats, action, trocar, wrist)
+    def decode(params, stats, x0, measured, condition, trocar):
+        return execution.command(method, stats, x0, trocar, wrist)
 
-    def generate(params, stats, keys, observation, trocar, is_limited=False):
-        condition = _condition(params, stats, observation, trocar)
-        reach = stats.action.reach if is_limited else sequences.UNLIMITED
-        return model.sample(params["learner"], keys, condition, reach)
-
-    def execute(params, stats, actions, observation, trocar):
-        return execution.command(method, stats, within(actions, stats.action.reach), trocar, wrist)
-
-    def _condition(params, stats, observation, trocar):
-        proprioception = _proprioception(stats, observation, trocar)
-        inputs = features.inference_inputs(
-            policy_config, sensors, stats, observation, proprioception
-        )
-        return networks.observe(params, inputs, features.trocar_condition(method, trocar))
-
-    def _proprioception(stats, observation, trocar):
-        space = method.action_space
-        return features.encode_proprioception(stats, space, observation, trocar, wrist)
-
+    acts = acting.make(method, policy_config, sensors, networks, wrist, decode)
     return Policy(
         networks.init,
         prepare,
         loss,
-        sample,
+        acts.sample,
         model.metrics,
         networks.cast_params,
         networks.prepare_for_inference,
-        generate,
-        execute,
+        acts.generate,
+        acts.execute,
     )

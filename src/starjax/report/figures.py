@@ -9,8 +9,9 @@ from starjax.evaluation import rate_map
 from starjax.evaluation.result import Trial
 from starjax.report import captions, compare, outcomes, results, stats, style
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # for annotations alone
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _BIN = 0.005  # m of distance pooled in one point
 _DISC = 0.05  # m, radius of Eq. 19's disc
@@ -135,7 +136,7 @@ def _whiskers(axis: "Axes", run: results.Run, offset: float, stroke: str) -> Non
     style.rates(axis, x, scores, run.result.method, run.label, stroke)
 
 
-def _disc(figure: Any, axis: "Axes", run: results.Run, shades: dict[str, str]) -> None:
+def _disc(figure: "Figure", axis: "Axes", run: results.Run, shades: dict[str, str]) -> None:
     """Draws trocars from above: a smoothed map of a sweep, else a dot per trocar."""
     groups = outcomes.by_trocar(run.sweep.trials if run.sweep else run.trials)
     arms = len(groups[0][0].radius)

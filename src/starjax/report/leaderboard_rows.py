@@ -9,7 +9,7 @@ import msgspec
 
 from starjax.core import methods
 from starjax.evaluation import protocol, result, structure
-from starjax.evaluation.disturbances import current_name
+from starjax.evaluation.content import DisturbanceScores, ResultScene
 from starjax.report import formats, outcomes, stats
 from starjax.runtime import files
 from starjax.sim import registries
@@ -74,32 +74,14 @@ class RowOfFile(NamedTuple):
     reasons: list[str]
 
 
-class _SceneOf(msgspec.Struct):
-    task: str
-    arms: tuple[str, ...]
-
-
-class _Counts(msgspec.Struct):
-    successes: int
-    trials: int
-
-
-class _LevelScore(msgspec.Struct):
-    strict: _Counts
-
-
-class _LevelScores(msgspec.Struct):
-    levels: dict[str, _LevelScore]
-
-
 class _StressFile(msgspec.Struct, kw_only=True):
-    scene: _SceneOf
+    scene: ResultScene
     method: str
     weights: str
     seed: int
     trials_at_each_trocar: int
     time_limit_s: float
-    disturbances: dict[str, _LevelScores]
+    disturbances: dict[str, DisturbanceScores]
     benchmark_version: int | None = None
     commit: str | None = None
     dirty: bool | None = None
@@ -144,8 +126,7 @@ def _stress(path: Path) -> RowOfFile:
     found = structure.convert(path, files.read_json(path), _StressFile)
     scene, version = found.scene, found.benchmark_version
     scores = {}
-    for old_or_new, kind in found.disturbances.items():
-        name = current_name(old_or_new)
+    for name, kind in found.disturbances.items():
         score = kind.levels.get(f"{protocol.STRESS[name]:g}") if name in protocol.STRESS else None
         if score:
             scores[name] = stats.rate(score.strict.successes, score.strict.trials)

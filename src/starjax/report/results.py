@@ -188,5 +188,5 @@ def _is_recorded(trial: Trial, track: recorded.Trajectory) -> bool:
     if length < 2 or length != trial.steps or not np.isfinite(track.p_world_tip).all():
         return False
     if track.rcm_error is None or trial.rcm_max_mm is None:
-        return True  # old files lack them
+        return False
     return bool(np.isclose(1e3 * track.rcm_error.max(), trial.rcm_max_mm, rtol=1e-5, atol=0))

@@ -8,7 +8,7 @@ import msgspec
 
 from starjax.core import config_json, methods
 from starjax.evaluation import result, structure
-from starjax.evaluation.content import Hardware, Milliseconds
+from starjax.evaluation.content import DisturbanceScores, Hardware, Milliseconds
 from starjax.runtime import files
 
 Lines = list[dict[str, Any]]
@@ -21,39 +21,9 @@ class _Bench(msgspec.Struct, kw_only=True):
     hardware: Hardware | None = None
 
 
-class _Strict(msgspec.Struct):
-    successes: int
-    trials: int
-    rate: float
-
-
-class _Executed(msgspec.Struct):
-    mean: float
-    p99: float | None = None
-
-
-class _RcmError(msgspec.Struct):
-    executed: _Executed
-
-
-class _WallForce(msgspec.Struct):
-    p99: float | None = None
-
-
-class _Level(msgspec.Struct):
-    strict: _Strict
-    rcm_error_mm: _RcmError
-    wall_force_N: _WallForce | None = None
-
-
-class _Levels(msgspec.Struct):
-    unit: str
-    levels: dict[str, _Level]
-
-
 class _Stress(msgspec.Struct):
     weights: str
-    disturbances: dict[str, _Levels]
+    disturbances: dict[str, DisturbanceScores]
 
 
 class _Line(msgspec.Struct):

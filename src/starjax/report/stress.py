@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starjax.evaluation.disturbances import current_name
 from starjax.report import formats, stats, style
 
 if TYPE_CHECKING:
@@ -33,7 +32,7 @@ def table(content: Content) -> formats.Table:
         "RCM p99 (mm)",
         "Wall p99 (N)",
     ]
-    kinds = _kinds(content)
+    kinds = content["disturbances"]
     is_watched = any(
         "alarms" in score for kind in kinds.values() for score in kind["levels"].values()
     )
@@ -63,7 +62,7 @@ def markdown(content: Content) -> str:
 
 def draw(content: Content, dark: bool = False) -> Any:
     """Draws success and RCM error of every disturbance from its lowest to its highest level."""
-    kinds = _kinds(content)
+    kinds = content["disturbances"]
     angles = np.linspace(0.0, 2.0 * np.pi, len(kinds), endpoint=False)
     names = [f"{name}\n{_span(kind)}" for name, kind in kinds.items()]
     count = max(len(kind["levels"]) for kind in kinds.values())
@@ -108,11 +107,6 @@ def files(content: Content) -> dict[str, bytes]:
         "stress.png": style.save(figure, "png"),
         "stress.pdf": style.save(figure, "pdf"),
     }
-
-
-def _kinds(content: Content) -> dict[str, Any]:
-    """Returns the disturbances by today's names."""
-    return {current_name(name): kind for name, kind in content["disturbances"].items()}
 
 
 def _rate(score: Content) -> str:

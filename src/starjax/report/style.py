@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 from starjax.core import methods
 from starjax.report import stats
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # for annotations alone
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 SUCCESS, FAILURE = "#2083C5", "#D55E00"
 # In the order of the methods' table: a method keeps its colour in every figure.
@@ -126,7 +127,7 @@ def rates(
 
 
 def legend(
-    figure: Any,
+    figure: "Figure",
     handles: Sequence[Any],
     labels: Sequence[str],
     side: str = "center",
@@ -139,7 +140,7 @@ def legend(
     figure.legend(handles, labels, **place, **settings)
 
 
-def save(figure: Any, kind: str, dark: bool = False) -> bytes:
+def save(figure: "Figure", kind: str, dark: bool = False) -> bytes:
     """Saves a figure as bytes of a png or pdf file, reproducible to the byte.
 
     Args:

@@ -116,7 +116,9 @@ def _starter(env: _EnvFns, agent: _AgentFns) -> Callable[..., RolloutState]:
         key_env, key_agent = jax.random.split(key)
         return env.reset(key_env, EnvParams(trials.trocar, levels=levels)), key_agent
 
-    def start(key: jax.Array, params: Any, trials: Trials, levels: Any) -> RolloutState:
+    def start(
+        key: jax.Array, params: Any, trials: Trials, levels: dict[str, jax.Array] | None
+    ) -> RolloutState:
         state, keys = jax.vmap(start_one, in_axes=(None, 0, None))(key, trials, levels)
         # A function: an agent that reads no observation costs no camera.
         memory = agent.init(params, keys, state, lambda: _of_all(env.observe)(state))
@@ -179,7 +181,7 @@ def _of_all(observe: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _fields(
-    env: _EnvFns, record: episodes.Record, state: EnvState, memory: Any = None
+    env: Env | _EnvFns, record: episodes.Record, state: EnvState, memory: Any = None
 ) -> dict[str, jax.Array]:
     """Records N episodes that stand still, for the shapes."""
     observed = _of_all(env.observe)(state) if record.observes else None

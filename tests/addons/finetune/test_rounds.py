@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import stubs
 
-from starjax.addons.finetune import attempts, dagger, mixing, rounds, self_imitation
-from starjax.core.types import Command, Pose
+from starjax.addons.finetune import dagger, mixing, rounds
+from starjax.core.types import Command
 from starjax.data import load, redraw, store
 from starjax.rollouts import agent, takeover
 from starjax.rollouts.placement import DeviceLayout
@@ -122,32 +122,3 @@ def test_images_are_drawn_from_the_recorded_state(tmp_path):
     assert (
         np.linalg.norm(goal - np.asarray(loaded.command.pose.p)[last][:, 0], axis=-1) < 6e-3
     ).all()
-
-
-def wander(params, stats, keys, observation, trocar):
-    """A policy that goes to its goal or to a place of its own, by its noise."""
-    goal = observation.state[:, -1, :3]
-    lost = jax.vmap(jax.random.bernoulli)(keys)
-    p = jnp.where(lost[:, None], -goal, goal)[:, None, None]
-    R = jnp.broadcast_to(jnp.eye(3), (len(p), 40, 1, 3, 3))
-    return Command(Pose(R, jnp.broadcast_to(p, (len(p), 40, 1, 3))), jnp.ones((len(p), 40, 1)))
-
-
-def test_self_imitation_keeps_a_success_of_each_start_that_was_failed_too(tmp_path):
-    root, policy = tmp_path / "rollouts", agent.from_policy(wander, 1, 40)
-    found = rounds.collect(
-        root,
-        stubs.make_env(unlucky=0.0),
-        TROCARS,
-        self_imitation.way(policy, (None, None), "state"),
-        SETTINGS._replace(max_steps=35),
-        layout=DeviceLayout(lanes=12),
-        report=lambda _: None,
-    )
-    won = found.success.sum(-1)
-    assert found.success.shape == (12, self_imitation.ATTEMPTS)
-    np.testing.assert_array_equal(found.kept, (won > 0) & (won < self_imitation.ATTEMPTS))
-    assert found.kept.any() and len(store.keys(root)) == found.kept.sum()
-    actor = load.actors(root)
-    assert not actor.any() and len(mixing.learned_frames(actor, "success")) == len(actor)
-    assert attempts.repeated(policy) == attempts.repeated(policy)  # one program

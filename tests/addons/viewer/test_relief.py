@@ -88,8 +88,8 @@ def test_fine_tuning_takes_it_only_where_it_belongs(root, relieved, tmp_path):
         return interventions.find(settings, env, trocars.select(task.trocars, slice(count)))
 
     assert find() == root
-    with mistakes.of("--interventions", "--by self"):
-        find(by="self")
+    with mistakes.of("--interventions", "--by rl"):
+        find(by="rl")
     with mistakes.of("--interventions", f"0002-0000-{SEED}"):
         find(count=2)
     with mistakes.of("--interventions"):

@@ -14,7 +14,7 @@ from starjax.addons.viewer import episode_alarm, simulation
 from starjax.addons.viewer.frame import outcome
 from starjax.core.types import Command
 from starjax.evaluation import alarms
-from starjax.policies.monitor import calibrate, scores
+from starjax.policies.monitor import record, scores
 from starjax.rollouts import agent, engine, episodes, plans
 from starjax.sim import arm_motion, ik, moving_trocars, registries, wrist_motion
 from starjax.sim import scene as scenes
@@ -186,8 +186,8 @@ def test_a_live_episode_has_the_alarm_of_its_evaluation():
     values = alarms.of_episodes([episode], ALARM_SETTINGS, 60)
     limit = np.nanmax(values[0, :4, 0]) * 0.999
     width = np.array([1.0, 1e9, 1e9, 1e9, 1e9, 1e9])
-    monitor = calibrate.Monitor(np.zeros(6), width, limit, 1.0, 0.05, 20, ALARM_SETTINGS, "")
-    times, _ = calibrate.first_alarms(monitor, values)
+    monitor = record.Monitor(np.zeros(6), width, limit, 1.0, 0.05, 20, ALARM_SETTINGS, "")
+    times, _ = record.first_alarms(monitor, values)
     for watched, text in ((None, ""), (monitor, f"alarm at {times[0]:.1f} s: disagreement")):
         live = simulation.make("policy", env, batch, params)
         alarm = episode_alarm.EpisodeAlarm(watched)

@@ -12,7 +12,6 @@ import repeats
 from starjax.core import config, errors
 from starjax.policies.learners import diffusion as learner
 from starjax.policies.models import diffusion, schedule
-from starjax.policies.models.kernels import parallel_ddim
 
 
 def tiny(**changed):
@@ -33,6 +32,7 @@ def test_samples_are_what_was_learned(learned):
 
 @pytest.mark.slow
 def test_samples_are_the_same_where_steps_are_side_by_side(learned, monkeypatch):
+    parallel_ddim = pytest.importorskip("starjax.addons.decisions.parallel_ddim")
     params, _ = learned
     ten = tiny(ddim_steps=10)
     wanted, calls = repeats.sampled(ten, params), []

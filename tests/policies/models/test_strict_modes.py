@@ -8,9 +8,13 @@ import numpy as np
 import pytest
 
 from starjax.policies.models import diffusion, encoders, kernels, roll_net, schedule, unet1d
-from starjax.policies.models.kernels import packed_params, parallel_ddim, sampling_unet
+from starjax.policies.models.kernels import packed_params
 
 pytestmark = pytest.mark.slow
+parallel_ddim, sampling_unet = (
+    pytest.importorskip(f"starjax.addons.decisions.{name}")
+    for name in ("parallel_ddim", "sampling_unet")
+)
 
 MODES = {
     "promotion of types": lambda: jax.numpy_dtype_promotion("strict"),

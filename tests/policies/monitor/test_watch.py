@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from starjax.policies.monitor import calibrate, scores, watch
+from starjax.policies.monitor import record, scores, watch
 
 SETTINGS = scores.ScoreSettings(execute=8, control_hz=30.0, still=6)
 HORIZON, S = 16, len(scores.NAMES)
@@ -24,12 +24,12 @@ def recorded(made: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
     return made[decision, index], made[decision, index + SETTINGS.execute]
 
 
-def monitor(**fields) -> calibrate.Monitor:
+def monitor(**fields) -> record.Monitor:
     default = {
         "center": np.zeros(S), "width": np.ones(S), "threshold": np.inf, "clock_s": 1.0,
         "alpha": 0.05, "count": 100, "settings": SETTINGS, "digest": "",
     }  # fmt: skip
-    return calibrate.Monitor(**{**default, **fields})
+    return record.Monitor(**{**default, **fields})
 
 
 def test_equal_plans_do_not_disagree_and_a_shift_is_its_length():

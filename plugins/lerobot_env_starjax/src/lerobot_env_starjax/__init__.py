@@ -37,7 +37,7 @@ class StarjaxEnv(EnvConfig):
 
     def __post_init__(self) -> None:
         """Fills in the features, whose shapes are those of the task."""
-        from starjax.envs import exported
+        from starjax.addons.formats import exported
         from starjax.sim import registries
 
         task = registries.tasks.get(str(self.task))

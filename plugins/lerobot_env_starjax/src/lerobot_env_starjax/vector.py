@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from starjax.envs import exported
+from starjax.addons.formats import exported
 
 
 class LeRobotVectorEnv(exported.ExportedVectorEnv):

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import optax
 
 from starjax.policies.models import layers
+from starjax.sim.state import Env, EnvState
 
 WIDTH, LAYERS = 256, 3
 RATE = 5e-4  # learning rate
@@ -46,11 +47,11 @@ class ValueNet(nn.Module):
 _ADAM = optax.adam(RATE)
 
 
-def inputs(env: Any) -> Callable[[Any], jax.Array]:
+def inputs(env: Env) -> Callable[[Any], jax.Array]:
     """Makes the function from EnvState `[N]` to the inputs `[N, K]`."""
     task = env.task
 
-    def of_one(state: Any) -> jax.Array:
+    def of_one(state: EnvState) -> jax.Array:
         fields = task.state(env.scene.bound, state.layout, state.measurements)
         parts = (
             fields,

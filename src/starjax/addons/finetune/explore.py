@@ -21,6 +21,7 @@ from starjax.rcm.trocar import Trocar
 from starjax.runtime import precompile
 from starjax.sim import env as sim_env
 from starjax.sim import wrists
+from starjax.sim.state import Env, EnvState
 
 See = Callable[[Any, jax.Array], jax.Array]
 
@@ -75,7 +76,7 @@ class Experience(NamedTuple):
 
 
 def make(
-    env: Any, policy: Policy, see: See | None, cameras: tuple[str, ...], settings: ExploreSettings
+    env: Env, policy: Policy, see: See | None, cameras: tuple[str, ...], settings: ExploreSettings
 ) -> precompile.Program:
     """Builds the program of a batch of episodes.
 
@@ -103,7 +104,7 @@ def make(
     def look(vision: Any, past: Any) -> Observation:
         """Observes states `[O, N]`; returns leaves `[N, O, ...]`."""
 
-        def one(state: Any) -> Observation:
+        def one(state: EnvState) -> Observation:
             found = observe(state)
             if see is None:
                 return found

@@ -23,6 +23,7 @@ from starjax.rollouts import trocars as configurations
 from starjax.rollouts.agent import BatchAgent
 from starjax.rollouts.placement import DEFAULT_LAYOUT, DeviceLayout
 from starjax.sim import env as sim_env
+from starjax.sim.state import Env
 
 Job = tuple[episodes.Trial, int]  # a trial and the number of its run, see `Way`
 
@@ -114,7 +115,7 @@ class Outcomes(NamedTuple):
     cause: np.ndarray
 
 
-def describe(env: Any, trocars: Trocar, way: Way, settings: RoundSettings) -> dict[str, Any]:
+def describe(env: Env, trocars: Trocar, way: Way, settings: RoundSettings) -> dict[str, Any]:
     """Returns the content of dataset.json."""
     recorded = env if way.record.observes else sim_env.without_images(env)
     plain = schema.DemoSettings(
@@ -134,7 +135,7 @@ def describe(env: Any, trocars: Trocar, way: Way, settings: RoundSettings) -> di
 
 def collect(
     root: Path,
-    env: Any,
+    env: Env,
     trocars: Trocar,
     way: Way,
     settings: RoundSettings,

@@ -11,10 +11,10 @@ from starjax.core.limits import Count, NotNegative, Range
 class FinetuneConfig:
     """Settings of `starjax finetune`, apart from the policy."""
 
-    # dagger: an expert finishes episodes in trouble, and the policy learns the expert's part; self:
-    # the policy learns successes of its own noisy rollouts; rl: a policy gradient raises strict
-    # success; distill: the frozen flow of a policy of onestep teaches it the one step
-    by: Literal["dagger", "self", "rl", "distill"] = "dagger"
+    # dagger: an expert finishes episodes in trouble, and the policy learns the expert's part; rl: a
+    # policy gradient raises strict success; distill: the frozen flow of a policy of onestep teaches
+    # it the one step
+    by: Literal["dagger", "rl", "distill"] = "dagger"
     # directory of a person's interventions, see starjax teleop --policy; dagger learns them too
     interventions: str = ""
     rounds: Annotated[int, Range(1, 100)] = 3  # rounds of rollouts and training

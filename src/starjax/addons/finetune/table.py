@@ -4,11 +4,16 @@ from starjax.core.extensions import AddOn, Subcommand
 
 _HERE = "starjax.addons.finetune"
 TABLE = AddOn(
-    "fine-tuning in the simulator, and experts that take over",
+    "fine-tuning in the simulator, experts that take over, and runtime monitors",
     commands={
         "finetune": Subcommand(
             f"{_HERE}.commands.finetune",
             "improve a trained policy in the simulator",
+            ("sim", "train"),
+        ),
+        "calibrate": Subcommand(
+            f"{_HERE}.commands.calibrate",
+            "add a runtime monitor to a trained policy",
             ("sim", "train"),
         ),
     },

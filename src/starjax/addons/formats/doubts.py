@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy import spatial
@@ -14,6 +13,7 @@ from starjax.addons.formats.motion import Motion
 from starjax.addons.formats.trocars import MISSED
 from starjax.data import shafts
 from starjax.sim import trocar_region
+from starjax.sim.task import Task
 
 _LEAST_MOTION = 5e-3  # m; the tips of a demonstration move farther
 _STEPS_AWAY = 10.0  # typical steps between a command and the next tip
@@ -70,7 +70,7 @@ def of_dataset(
     tips: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
     places: np.ndarray,
     numbers: Sequence[int],
-    task: Any,
+    task: Task,
     is_placed: bool = False,
 ) -> Iterator[str]:
     """Yields notes on the motion's extent, the shafts' direction and the trocars' places.
@@ -134,7 +134,7 @@ def _scattered(places: np.ndarray, arm: int) -> Iterator[str]:
             )
 
 
-def of_state(arrays: Mapping[str, np.ndarray], mapping: Map, task: Any) -> Iterator[str]:
+def of_state(arrays: Mapping[str, np.ndarray], mapping: Map, task: Task) -> Iterator[str]:
     """Yields a note if the state has another size than the task's."""
     if mapping.state:
         size, wanted = maps.pick(arrays, mapping.state).shape[1], task.state_size

@@ -24,6 +24,7 @@ from starjax.data import schema, store
 from starjax.rollouts import episodes
 from starjax.runtime import files, xla
 from starjax.sim import registries
+from starjax.sim.task import Task
 
 
 class Imported(NamedTuple):
@@ -140,7 +141,7 @@ def import_mapped(
     )
 
 
-def _fits(mapping: Map, task: Any) -> None:
+def _fits(mapping: Map, task: Task) -> None:
     arms, slots = len(mapping.arms), len(task.slots)
     if arms != slots:
         raise errors.UsageError("--map: arms", f"{slots}, as task {mapping.task} has", arms)
@@ -183,7 +184,7 @@ def _squeezed(source: Source, mapping: Map) -> Iterator[str]:
 
 
 def _describe(
-    source: Source, mapping: Map, task: Any, kept: list[Kept], centres: np.ndarray, hz: float
+    source: Source, mapping: Map, task: Task, kept: list[Kept], centres: np.ndarray, hz: float
 ) -> dict[str, Any]:
     reference = np.array([slot.p_world_ref for slot in task.slots])
     parameters = rcm.trocar_from_position(centres.astype(np.float32), reference.astype(np.float32))

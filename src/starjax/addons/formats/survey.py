@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from msgspec import structs
@@ -25,6 +25,7 @@ from starjax.addons.formats.base import Source
 from starjax.addons.formats.mapping import Map
 from starjax.core import errors
 from starjax.data import shafts
+from starjax.sim.task import Task
 
 _DOWN = (0.0, 0.0, -1.0)
 
@@ -75,7 +76,7 @@ def survey(
     source: Source,
     mapping: Map,
     folder: Path,
-    task: Any,
+    task: Task,
     note: Callable[[int], None] = lambda count: None,
 ) -> Survey:
     """Reads the numbers of all chosen episodes; those that cannot be read become notes.
@@ -156,7 +157,7 @@ def survey(
 
 
 def _placed(
-    mapping: Map, tips: list[trocars.Tips], places: np.ndarray, task: Any
+    mapping: Map, tips: list[trocars.Tips], places: np.ndarray, task: Task
 ) -> tuple[Map, list[trocars.Tips], list[np.ndarray]]:
     """Moves the mean trocars to the task's, and turns the mean shaft downwards."""
     reference = np.array([slot.p_world_ref for slot in task.slots])

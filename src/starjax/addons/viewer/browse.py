@@ -4,7 +4,7 @@ import functools
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -21,6 +21,9 @@ from starjax.data import redraw, schema, store
 from starjax.rollouts import episodes, trial_key
 from starjax.sim import registries, scene
 from starjax.sim.names import SceneNames
+
+if TYPE_CHECKING:  # for annotations alone
+    import viser
 
 
 class RecordedDataset(NamedTuple):
@@ -164,7 +167,7 @@ class EpisodePlayer:
       t: the displayed control step.
     """
 
-    def __init__(self, server: Any, recordings: Recordings):
+    def __init__(self, server: "viser.ViserServer", recordings: Recordings):
         self._server, self._recordings = server, recordings
         self.hz = recordings.hz
         self._status = page.Status(server.gui)
@@ -215,7 +218,9 @@ class EpisodePlayer:
             )
 
 
-def run(server: Any, recordings: Recordings, should_stop: Callable[[], bool]) -> str:
+def run(
+    server: "viser.ViserServer", recordings: Recordings, should_stop: Callable[[], bool]
+) -> str:
     """Shows episodes until `should_stop()`; returns a summary line."""
     gui, requests, keys = server.gui, page.UiRequests(), list(recordings.keys)
     episode = EpisodePlayer(server, recordings)

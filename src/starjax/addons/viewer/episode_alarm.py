@@ -4,7 +4,7 @@ import numpy as np
 
 from starjax.addons.viewer.frame import Frame
 from starjax.addons.viewer.simulation import LiveState
-from starjax.policies.monitor.calibrate import Monitor
+from starjax.policies.monitor.record import Monitor
 from starjax.policies.monitor.watch import Watch
 
 

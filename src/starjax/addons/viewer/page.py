@@ -10,13 +10,16 @@ import io
 import queue
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.ndimage
 
 from starjax.addons.viewer import front
 from starjax.core import errors
+
+if TYPE_CHECKING:  # for annotations alone
+    import viser
 
 HOST = "127.0.0.1"
 PORT = 8080
@@ -69,7 +72,7 @@ def serve(
             server.stop()
 
 
-def address(server: Any) -> str:
+def address(server: "viser.ViserServer") -> str:
     """Returns the address to open in a browser."""
     return f"http://{server.get_host()}:{server.get_port()}"
 
@@ -144,7 +147,7 @@ class Player:
       is_playing: true unless paused.
     """
 
-    def __init__(self, gui: Any, requests: UiRequests):
+    def __init__(self, gui: "viser.GuiApi", requests: UiRequests):
         self.is_playing = True
 
         def play(is_playing: bool) -> None:
@@ -181,7 +184,9 @@ class Player:
 class Choices:
     """Dropdowns by name; a change of one requests `choice`."""
 
-    def __init__(self, gui: Any, requests: UiRequests, **options: tuple[Sequence[str], str]):
+    def __init__(
+        self, gui: "viser.GuiApi", requests: UiRequests, **options: tuple[Sequence[str], str]
+    ):
         self._dropdowns = {}
         for name, (names, value) in options.items():
             label = name.capitalize().replace("_", " ")
@@ -201,7 +206,7 @@ class Choices:
             dropdown.value = value
 
 
-def side_panel(gui: Any, label: str, width: int = _PANEL_WIDTH) -> tuple[Any, Any]:
+def side_panel(gui: "viser.GuiApi", label: str, width: int = _PANEL_WIDTH) -> tuple[Any, Any]:
     """Adds a panel of so many pixels at the left; returns it and its tab, to fill in a `with`."""
     panel = gui.add_panel()
     panel.dock_left()
@@ -212,7 +217,7 @@ def side_panel(gui: Any, label: str, width: int = _PANEL_WIDTH) -> tuple[Any, An
 class Pictures:
     """Camera images, one per label, enlarged to a width in pixels."""
 
-    def __init__(self, gui: Any, labels: Sequence[str], width: int = _PANEL_WIDTH):
+    def __init__(self, gui: "viser.GuiApi", labels: Sequence[str], width: int = _PANEL_WIDTH):
         blank = np.zeros((2, 2, 3), np.uint8)
         self._images = [gui.add_image(blank, label=label) for label in labels]
         self._width = width
@@ -234,7 +239,7 @@ def enlarged(image: np.ndarray, width: int) -> np.ndarray:
 class Status:
     """Lines of status. They are HTML, because the page is slow to set Markdown."""
 
-    def __init__(self, gui: Any, text: str = ""):
+    def __init__(self, gui: "viser.GuiApi", text: str = ""):
         self._handle, self._text = gui.add_html(_as_html(text)), text
 
     def set(self, text: str) -> None:

@@ -3,11 +3,14 @@
 import collections
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starjax.addons.viewer.frame import Frame
+
+if TYPE_CHECKING:  # for annotations alone
+    import viser
 
 COLOURS = ("#00796b", "#c2611f")  # colours of the first and the second rollout
 _AXES = ("#c23b3b", "#3f8f3f", "#3b62c2")  # x, y, z, as 3D views colour them
@@ -21,7 +24,7 @@ _PADDING = (12, 24, 0, 0)  # pixels; without the first, the top tick's label is 
 class Plots:
     """Two plots of one or two rollouts, extended frame by frame."""
 
-    def __init__(self, gui: Any, labels: Sequence[str], hz: float):
+    def __init__(self, gui: "viser.GuiApi", labels: Sequence[str], hz: float):
         self._hz, kept = hz, round(_SPAN_S * hz)
         self._frames = [collections.deque[Frame](maxlen=kept) for _ in labels]
         self._top = _MIN_TOP
@@ -56,7 +59,10 @@ class Plots:
 
 
 def _plot(
-    gui: Any, title: str, lines: Sequence[tuple[str, str]], y: tuple[float, float] | None = None
+    gui: Any,
+    title: str,
+    lines: Sequence[tuple[str, str]],
+    y: tuple[float, float] | None = None,
 ) -> Any:
     """Adds an empty plot of lines (name, colour)."""
     blank = np.arange(2.0)

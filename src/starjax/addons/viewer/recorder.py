@@ -17,7 +17,7 @@ from starjax.addons.viewer import simulation, tip_handle
 from starjax.addons.viewer.frame import Frame
 from starjax.core.types import Command
 from starjax.data import schema, store
-from starjax.policies.monitor.calibrate import Monitor
+from starjax.policies.monitor.record import Monitor
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import episodes, programs, takeover, trial_key
 from starjax.rollouts import trocars as configurations
@@ -25,6 +25,7 @@ from starjax.runtime import files
 from starjax.runtime.precompile import Program
 from starjax.sim import env as sim_env
 from starjax.sim import wrists
+from starjax.sim.state import Env
 
 OPERATOR = "operator"  # in dataset.json, in place of a scripted expert's name
 
@@ -163,7 +164,7 @@ def steer(env: sim_env.Env, policy: Relieved | None = None) -> Steering:
 class Recorder:
     """A recorder of one episode after another into the folder `root`."""
 
-    def __init__(self, root: Path, env: Any, seed: int, policy: Relieved | None = None):
+    def __init__(self, root: Path, env: Env, seed: int, policy: Relieved | None = None):
         self._root, self._seed, self._policy = root, seed, policy
         self._trocars = configurations.listed(env.task.trocars, len(env.p_world_ref))
         steps = round(env.task.time_limit_s * env.control_hz)
@@ -249,7 +250,7 @@ class Recorder:
 
 @contextlib.contextmanager
 def record_into(
-    root: Path, env: Any, seed: int, policy: Relieved | None = None
+    root: Path, env: Env, seed: int, policy: Relieved | None = None
 ) -> Iterator[Recorder]:
     """Yields a recorder into a folder, which stays locked until the end.
 

@@ -1,7 +1,7 @@
 """The live view of a policy that the operator can relieve, and whose takeovers are saved."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,6 +12,9 @@ from starjax.addons.viewer.selection import trocar_names
 from starjax.addons.viewer.shared_control import SharedControl
 from starjax.addons.viewer.simulation import LiveState, Simulation
 from starjax.addons.viewer.view import Rollouts
+
+if TYPE_CHECKING:  # for annotations alone
+    import viser
 
 
 class FixedTrocars:
@@ -36,7 +39,7 @@ class FixedTrocars:
 
 
 def run(
-    server: Any,
+    server: "viser.ViserServer",
     label: str,
     steering: Steering,
     recorder: Recorder,

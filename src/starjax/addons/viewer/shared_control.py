@@ -1,7 +1,7 @@
 """Control of an episode by an operator's hand and, if there is one, the policy that it relieves."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import mujoco
@@ -15,6 +15,10 @@ from starjax.addons.viewer.teleop_target import Pilot
 from starjax.policies import in_env
 from starjax.runtime import files
 from starjax.sim import wrists
+from starjax.sim.state import Env
+
+if TYPE_CHECKING:  # for annotations alone
+    import viser
 
 
 class SharedControl:
@@ -102,12 +106,12 @@ def relieved(file: Path, arms: tuple[str, ...] = ()) -> tuple[Any, Relieved]:
     )
 
 
-def add_pilot(server: Any, env: Any, device: Device | None = None) -> Pilot:
+def add_pilot(server: "viser.ViserServer", env: Env, device: Device | None = None) -> Pilot:
     """Adds the hand to the page: handle, keys and device."""
     return Pilot(server, env.task.arms, camera_axes(env), device, wrists.common(env.task))
 
 
-def add_keys(gui: Any, requests: page.UiRequests, is_shared: bool) -> None:
+def add_keys(gui: "viser.GuiApi", requests: page.UiRequests, is_shared: bool) -> None:
     """Adds the keys that end an episode and, if it is shared, pass control.
 
     They request `save`, `discard`, `pass`.
@@ -119,7 +123,7 @@ def add_keys(gui: Any, requests: page.UiRequests, is_shared: bool) -> None:
         page.add_command(gui, "Pass control", "T", lambda: requests.add("pass"))
 
 
-def save(server: Any, recorder: Recorder, control: SharedControl) -> bool:
+def save(server: "viser.ViserServer", recorder: Recorder, control: SharedControl) -> bool:
     """Saves the episode and notifies the user; returns False if the disk refused it."""
     note = "" if recorder.moments[-1].frame.success else ", which training leaves out"
     try:
@@ -131,7 +135,7 @@ def save(server: Any, recorder: Recorder, control: SharedControl) -> bool:
     return True
 
 
-def camera_axes(env: Any) -> np.ndarray:
+def camera_axes(env: Env) -> np.ndarray:
     """Returns the axes of the first camera's image, see `teleop_target.view_axes`."""
     model = env.scene.mj_model
     data = mujoco.MjData(model)

@@ -15,7 +15,7 @@ import numpy as np
 from starjax.addons.viewer.frame import Frame
 from starjax.core import methods
 from starjax.policies import in_env, packaged
-from starjax.policies.monitor.calibrate import Monitor
+from starjax.policies.monitor.record import Monitor
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import agent as agents
 from starjax.rollouts import trial_key

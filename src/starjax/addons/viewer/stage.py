@@ -2,7 +2,7 @@
 
 import collections
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -12,6 +12,9 @@ from starjax.addons.viewer.frame import Frame
 from starjax.core.types import Pose
 from starjax.sim import still_bodies, thread_geoms
 from starjax.sim.camera import geometry
+
+if TYPE_CHECKING:  # for annotations alone
+    import viser
 
 _SPACING = 0.6  # m between two rollouts
 _PATH_STEPS = 90  # control steps that the tip's path stays
@@ -85,7 +88,7 @@ class Stage:
         self._root.remove()
 
 
-def aim(server: Any, rollouts: int) -> None:
+def aim(server: "viser.ViserServer", rollouts: int) -> None:
     """Points the camera of new pages at all rollouts."""
     others = rollouts - 1
     middle = 0.5 * _SPACING * others

@@ -17,5 +17,8 @@ TABLE = AddOn(
             ("sim", "train", "viewer"),
         ),
     },
-    hooks={"playback": f"{_HERE}.playback_3d:record"},
+    hooks={
+        "playback": f"{_HERE}.playback_3d:record",
+        "dataset_page": f"{_HERE}.dataset_page:write",
+    },
 )

@@ -4,7 +4,7 @@ With a policy at work, a key passes control to the hand and back.
 """
 
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,6 +18,10 @@ from starjax.addons.viewer.stage import Stage, aim
 from starjax.addons.viewer.teleop_target import Pilot
 from starjax.addons.viewer.view import REST_S
 from starjax.rollouts import episodes
+from starjax.sim.state import Env
+
+if TYPE_CHECKING:  # for annotations alone
+    import viser
 
 _PICTURE_WIDTH = 480  # pixels
 _OVER = object()  # for a replay
@@ -33,7 +37,7 @@ class OperatorEpisode:
       distances: name of a point of the task -> mm to the nearest tip.
     """
 
-    def __init__(self, server: Any, steering: Steering, pilot: Pilot, seed: int):
+    def __init__(self, server: "viser.ViserServer", steering: Steering, pilot: Pilot, seed: int):
         self._steering, self.control = steering, SharedControl(steering, pilot, seed)
         env = steering.env
         self._limit = round(env.task.time_limit_s * env.control_hz)
@@ -88,7 +92,7 @@ class OperatorEpisode:
 
 
 def run(
-    server: Any,
+    server: "viser.ViserServer",
     steering: Steering,
     recorder: Recorder,
     should_stop: Callable[[], bool],
@@ -148,7 +152,7 @@ def run(
 
 
 def _status(
-    env: Any, episode: OperatorEpisode, recorder: Recorder, clock: page.Clock, is_replay: bool
+    env: Env, episode: OperatorEpisode, recorder: Recorder, clock: page.Clock, is_replay: bool
 ) -> str:
     """Returns the status lines of the page."""
     frame = episode.frame

@@ -7,7 +7,7 @@ functions on a few numbers, 30 times a second.
 
 import queue
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from starjax.addons.viewer.devices import Device, DeviceLost, Reading
 from starjax.addons.viewer.tip_handle import TipHandle
 from starjax.sim import registries
 from starjax.sim.task import Slot
+
+if TYPE_CHECKING:  # for annotations alone
+    import viser
 
 SPEED = 0.05  # m/s at full deflection of a device
 SPIN = 1.5  # rad/s at full deflection
@@ -144,7 +147,7 @@ class Pilot:
 
     def __init__(
         self,
-        server: Any,
+        server: "viser.ViserServer",
         arms: int,
         axes: np.ndarray,
         device: Device | None,

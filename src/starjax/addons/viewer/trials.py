@@ -29,8 +29,7 @@ def load(file: Path) -> Recordings:
     tracks = {
         f"trocar {x.trocar}, trial {x.trial}": (x, x.qpos)
         for x in recorded.read(file)
-        # Earlier versions kept one number per step of tasks with a thread.
-        if x.qpos is not None and x.qpos.ndim == 2
+        if x.qpos is not None
     }
     if not tracks:
         raise errors.UsageError("--trials", "trials with joint positions", file)

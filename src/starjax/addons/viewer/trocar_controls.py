@@ -4,7 +4,7 @@ An operator's own trocars stay from trial to trial until a configuration of the 
 """
 
 import secrets
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -15,6 +15,9 @@ from starjax.addons.viewer.handles import TrocarHandles
 from starjax.rcm.trocar import Trocar
 from starjax.sim import registries, sampling
 from starjax.sim.task import Slot, Task
+
+if TYPE_CHECKING:  # for annotations alone
+    import viser
 
 _MM, _DEG = 1e3, 180.0 / np.pi
 _UNITS = np.array([_MM, _DEG, _DEG])
@@ -30,7 +33,7 @@ class TrocarControls:
       is_own: the operator has moved a trocar since the last `release`.
     """
 
-    def __init__(self, server: Any, task: Task):
+    def __init__(self, server: "viser.ViserServer", task: Task):
         self._task, self._requests = task, page.UiRequests()
         self._p_world_ref = np.array([slot.p_world_ref for slot in task.slots], np.float32)
         self._handles = TrocarHandles(server.scene, task)
@@ -78,7 +81,7 @@ class TrocarControls:
         for part in (self._handles, *self._folders, self._button):
             part.remove()
 
-    def _rows(self, gui: Any, slot: Slot) -> list[Any]:
+    def _rows(self, gui: "viser.GuiApi", slot: Slot) -> list[Any]:
         space = registries.workspaces.get(slot.workspace)
         rows = []
         ranges = zip(_LABELS, (space.radius, space.polar, space.azimuth), _UNITS, _STEPS)

@@ -36,35 +36,6 @@ DISTURBANCES = Registry(
     },
     f"{_HERE}.base:Disturbance",
 )
-# Old name -> name. Files of earlier versions hold the old ones.
-RENAMED = {
-    "trocar_told": "trocar_offset",
-    "breathing_late": "breathing_tracked",
-    "late_view": "observation_delay",
-    "late_commands": "action_delay",
-    "dropped": "observation_dropout",
-    "servos": "weak_servos",
-}
-
-
-def current_name(name: str) -> str:
-    """Returns the name of the disturbance that a file of any version calls `name`."""
-    return RENAMED.get(name, name)
-
-
-def resolve(argument: str, names: Sequence[str]) -> list[str]:
-    """Returns today's names of disturbances; warns of old ones.
-
-    Raises:
-      errors.UsageError: a name is unknown.
-    """
-    known = DISTURBANCES.names()
-    for name in names:
-        if name in RENAMED:
-            errors.warn_renamed(name, RENAMED[name])
-        else:
-            errors.choice(argument, name, known)
-    return [current_name(name) for name in names]
 
 
 def chosen_levels(argument: str, texts: Sequence[str]) -> dict[str, tuple[float, ...]]:
@@ -79,7 +50,8 @@ def chosen_levels(argument: str, texts: Sequence[str]) -> dict[str, tuple[float,
     chosen: dict[str, tuple[float, ...]] = {}
     for text in texts:
         if "=" not in text:
-            chosen.setdefault(resolve(argument, [text])[0], ())
+            errors.choice(argument, text, DISTURBANCES.names())
+            chosen.setdefault(text, ())
             continue
         ((name, level),) = parse_levels(argument, [text]).items()
         chosen[name] = (*(chosen.get(name) or (0.0,)), level)
@@ -94,8 +66,8 @@ def parse_levels(argument: str, texts: Sequence[str]) -> dict[str, float]:
     """
     levels: dict[str, float] = {}
     for text in texts:
-        old_or_new, _, number = text.partition("=")
-        (name,) = resolve(argument, [old_or_new])
+        name, _, number = text.partition("=")
+        errors.choice(argument, name, DISTURBANCES.names())
         try:
             level = float(number)
         except ValueError:

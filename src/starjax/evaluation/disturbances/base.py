@@ -43,7 +43,7 @@ class Disturbance(NamedTuple):
       unit: of the levels.
       levels: those of an evaluation; the first, 0, is undisturbed.
       max_level: highest allowed level.
-      stream: text that seeds the draws, for a disturbance that was renamed; empty: its name.
+      stream: text that seeds the draws; empty: its name.
       on_params: (Env, DisturbanceState, EnvParams) -> EnvParams, before a reset.
       on_reset: (Env, DisturbanceState, EnvState) -> EnvState and memory, after a reset.
       on_camera: (DisturbanceState, Pose `[C]` of the cameras) -> Pose, after a reset; None for

@@ -64,7 +64,7 @@ def ddim_sample(
     diffusion_steps: int = 100,
     steps: int = 10,
     prepare: Callable[[jax.Array], Any] = lambda k: k,
-    reach: Any = None,
+    reach: jax.Array | None = None,
 ) -> jax.Array:
     """Samples by deterministic DDIM (eta = 0, 'leading' steps, clean sequence in `reach`).
 
@@ -101,7 +101,7 @@ def ddim_sample(
     return x
 
 
-def within(x: jax.Array, reach: Any) -> jax.Array:
+def within(x: jax.Array, reach: jax.Array | None) -> jax.Array:
     """Clips `x` to the lowest and highest value of `reach`, None: to [-1, 1]."""
     if reach is None:
         return jnp.clip(x, -1.0, 1.0)

@@ -59,7 +59,7 @@ def sample(
     *,
     steps: int,
     prepare: Callable[[jax.Array], Any] = lambda time: time,
-    reach: Any = None,
+    reach: jax.Array | None = None,
 ) -> jax.Array:
     """Takes Euler steps of one length from `noise` `[B, ...]` to a clean sequence.
 

@@ -12,6 +12,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 
 from starjax.policies.models import kernels
 from starjax.runtime import hashing
@@ -86,12 +87,14 @@ class Dense(nn.Module):
         return y + spread(bias.astype(x.dtype), y.shape)
 
 
-def xavier_init(key: jax.Array, shape: tuple[int, int], dtype: Any = None) -> jax.Array:
+def xavier_init(
+    key: jax.Array, shape: tuple[int, int], dtype: DTypeLike | None = None
+) -> jax.Array:
     """Draws within +-sqrt(6 / (inputs + outputs)), hashed as in `uniform_init`, for attention."""
     return math.sqrt(6.0 / sum(shape)) * _hashed(key, tuple(shape))
 
 
-def residual_mlp(x: jax.Array, width: int, blocks: int, dtype: Any) -> jax.Array:
+def residual_mlp(x: jax.Array, width: int, blocks: int, dtype: DTypeLike) -> jax.Array:
     """Runs a residual MLP on `[..., C]`, in the scope of the module that calls it.
 
     Args:

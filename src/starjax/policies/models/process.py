@@ -21,7 +21,7 @@ class Sample(Protocol):
         noise: jax.Array,
         *,
         prepare: Callable[[jax.Array], Any],
-        reach: Any,
+        reach: jax.Array | None,
     ) -> jax.Array:
         """Returns sequences from noise `[B, H, D]`, within `reach` `[2, D]`, None: [-1, 1].
 

@@ -11,7 +11,7 @@ before the next longer one.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,21 +26,7 @@ TEACHER_STEPS = 8  # Euler steps of the flow, its target
 WHOLE_WAY = 300.0
 
 
-class NoisedShortcut(NamedTuple):
-    """Sequences to learn from.
-
-    Attributes:
-      x: `[B, ...]`, with noise.
-      time: `[B]`, input of the network.
-      velocity: `[B, ...]`, of the flow; unused where time is WHOLE_WAY.
-    """
-
-    x: jax.Array
-    time: jax.Array
-    velocity: jax.Array
-
-
-def noised(key: jax.Array, x0: jax.Array) -> NoisedShortcut:
+def noised(key: jax.Array, x0: jax.Array) -> flow.NoisedFlow:
     """Adds noise to clean sequences `[B, ...]` at a random time, or at a path's start.
 
     A path starts from noise of a random scale, as samples of any temperature do. `key` is one
@@ -52,14 +38,14 @@ def noised(key: jax.Array, x0: jax.Array) -> NoisedShortcut:
     is_whole = jnp.arange(len(x0)) % EVERY == 0
     scale = _expand(jax.random.uniform(key_share, x0.shape[:1]), x0)
     start = scale * jax.random.normal(key_noise, x0.shape, x0.dtype)  # any temperature in [0, 1]
-    return NoisedShortcut(
+    return flow.NoisedFlow(
         jnp.where(_expand(is_whole, x0), start, at.x),
         jnp.where(is_whole, WHOLE_WAY, at.time),
         at.velocity,
     )
 
 
-def loss(predict: Callable[..., jax.Array], batch: NoisedShortcut) -> jax.Array:
+def loss(predict: Callable[..., jax.Array], batch: flow.NoisedFlow) -> jax.Array:
     """Returns the mean squared error of the velocity, or of a whole path's mean velocity.
 
     `predict(x, time)` returns it `[B, ...]`, `predict(x, time, rows)` for some rows of the batch.
@@ -69,7 +55,7 @@ def loss(predict: Callable[..., jax.Array], batch: NoisedShortcut) -> jax.Array:
     return jnp.mean((predict(batch.x, batch.time) - target) ** 2)
 
 
-def targets(predict: Callable[..., jax.Array], batch: NoisedShortcut) -> jax.Array:
+def targets(predict: Callable[..., jax.Array], batch: flow.NoisedFlow) -> jax.Array:
     """Returns targets `[B, ...]`: the flow's velocity, or a whole path's mean velocity."""
     count = len(batch.x)
     most = -(-count // EVERY)  # rounded up
@@ -93,7 +79,7 @@ def sample(
     *,
     correct_at: float = 0.0,
     prepare: Callable[[jax.Array], Any] = lambda time: time,
-    reach: Any = None,
+    reach: jax.Array | None = None,
 ) -> jax.Array:
     """Takes one step from `noise` `[B, ...]` to a clean sequence, clipped to `reach`.
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from starjax.policies.monitor import scores
-from starjax.policies.monitor.calibrate import Monitor
+from starjax.policies.monitor.record import Monitor
 
 
 class Alarm(NamedTuple):

@@ -61,9 +61,7 @@ WORK = {
 @pytest.mark.parametrize("part", kernels.VARIANTS)
 @pytest.mark.release
 def test_without_a_variant_the_reference_gives_the_same(part, monkeypatch):
-    module = importlib.import_module(
-        f"starjax.policies.models.kernels.{kernels.VARIANTS[part].split(':')[0]}"
-    )
+    module = importlib.import_module(kernels.VARIANTS[part].split(":")[0])
     monkeypatch.setattr(module, "pays", lambda *size: True)
     jax.clear_caches()
     with_it = jax.tree.leaves(jax.jit(WORK[part])())
@@ -78,8 +76,11 @@ def test_without_a_variant_the_reference_gives_the_same(part, monkeypatch):
 
 def test_every_file_is_named_by_one_line_and_nowhere_else(pytestconfig):
     source = pytestconfig.rootpath / "src/starjax"
-    files = {path.stem for path in (source / "policies/models/kernels").glob("*.py")} - {"__init__"}
-    assert sorted(line.split(":")[0] for line in kernels.VARIANTS.values()) == sorted(files)
-    others = [path for path in source.rglob("*.py") if path.parent.name != "kernels"]
+    folders = source / "policies/models/kernels", source / "addons/decisions"
+    files = {path.stem for folder in folders for path in folder.glob("*.py")}
+    files -= {"__init__", "table"}
+    named = [line.split(":")[0].split(".")[-1] for line in kernels.VARIANTS.values()]
+    assert sorted(named) == sorted(files)
+    others = [path for path in source.rglob("*.py") if path.parent not in folders]
     texts = {path: path.read_text() for path in others}
     assert not {path for path, text in texts.items() for name in files if name in text}

@@ -20,7 +20,7 @@ resume.
 
 Examples:
   starjax finetune runs/cpu/stardiff --by dagger
-  starjax finetune --policy compact --by self
+  starjax finetune --policy compact --rounds 1
   starjax finetune runs/onestep/stardiff --by rl"""
 
 

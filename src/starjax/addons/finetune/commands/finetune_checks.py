@@ -1,15 +1,15 @@
 """Policies that a way of fine-tuning cannot improve: refused before anything runs."""
 
 from pathlib import Path
-from typing import Any
 
-from starjax.addons.finetune import dagger, self_imitation
+from starjax.addons.finetune import dagger
 from starjax.addons.finetune.commands import interventions
 from starjax.addons.finetune.settings import FinetuneConfig
 from starjax.core import config as config_lib
 from starjax.core import errors
 from starjax.data import store
 from starjax.rcm.trocar import Trocar
+from starjax.sim.state import Env
 from starjax.sim.task import Task
 
 OF_ONE_STEP = ("rl", "distill")  # ways that need a learner of one evaluation
@@ -20,7 +20,7 @@ def check(
     settings: FinetuneConfig,
     config: config_lib.RunConfig,
     policy: config_lib.PolicyConfig,
-    env: Any,
+    env: Env,
     seen: Trocar,
 ) -> None:
     """Checks the settings of a fine-tuning against its policy.
@@ -38,8 +38,6 @@ def check(
     if settings.by in OF_ONE_STEP and policy.learner != _ONE_STEP:
         expected = f"a policy of the learner {_ONE_STEP}"
         raise errors.UsageError(f"--by {settings.by}", expected, policy.learner)
-    if settings.by == self_imitation.NAME:
-        self_imitation.noisy(policy)
     if settings.by == dagger.NAME:
         dagger.rescuer(env.task, demonstrator(config, env.task))
     if settings.interventions:

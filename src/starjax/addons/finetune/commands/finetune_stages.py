@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from starjax.addons.finetune import dagger, mixing, rounds, self_imitation
+from starjax.addons.finetune import dagger, mixing, rounds
 from starjax.addons.finetune.commands import finetune_checks, finetune_counts, interventions
 from starjax.addons.finetune.commands.finetune_work import Work
 from starjax.cli import demonstrations, messages, pipeline, policy_evaluation, stage_times
@@ -17,8 +17,8 @@ from starjax.core import config as config_lib
 from starjax.core import errors, methods
 from starjax.data import load, normalizer, store, windows
 from starjax.evaluation import statistics, trials
-from starjax.policies import in_env, policy_file
 from starjax.policies import policy as policies
+from starjax.policies import policy_file
 from starjax.policies.in_env import PolicyInEnv
 from starjax.rollouts import placement
 from starjax.runtime import processes
@@ -94,17 +94,12 @@ class Search:
         count, learned = len(outcomes.trial), int(outcomes.kept.sum())
         messages.indented(f"{count} trials, {learned} of them are learned")
         won = statistics.rate(outcomes.success[:, 0])
-        takeovers = {} if work.settings.by == "self" else finetune_counts.report(outcomes)
+        takeovers = finetune_counts.report(outcomes)
         return {"trials": count, "learned": learned, "success": won, **takeovers}
 
     def _way(self, who: PolicyInEnv) -> rounds.Way:
         trained, settings = who.trained, who.trained.policy
         params = (trained.params, trained.normalizer)
-        if self._work.settings.by == "self":
-            hot, row = self_imitation.noisy(settings), methods.METHODS[trained.method]
-            policy = policies.make(row, hot, who.env.task, cameras=trained.scene.cameras)
-            agent = in_env.batch_agent(trained.method, policy, hot)
-            return self_imitation.way(agent, params, settings.observation)
         expert = finetune_checks.demonstrator(self._work.config, who.env.task)
         hz = who.env.control_hz
         return dagger.way(who.agent(), params, who.env.task, expert, settings, self._limits, hz)

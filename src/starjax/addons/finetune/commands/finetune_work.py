@@ -26,6 +26,7 @@ from starjax.policies import in_env, policy_file
 from starjax.policies.in_env import PolicyInEnv
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import trocars
+from starjax.rollouts.sharing import Share
 from starjax.runtime import files
 
 _WARMUP = 500  # training steps, in which the new optimiser's averages settle
@@ -81,7 +82,7 @@ class Work(NamedTuple):
 
 
 def begin(
-    settings: FinetuneConfig, path: policy_args.PolicyPath, started: session.Session, share: Any
+    settings: FinetuneConfig, path: policy_args.PolicyPath, started: session.Session, share: Share
 ) -> Work:
     """Reads the policy and claims the directory.
 

@@ -15,19 +15,20 @@ from starjax.addons.finetune.settings import FinetuneConfig
 from starjax.cli import messages, policy_args, policy_evaluation, session, stage_times
 from starjax.core import errors, methods
 from starjax.evaluation import statistics
+from starjax.policies.in_env import PolicyInEnv
+from starjax.rollouts.sharing import Share
 from starjax.runtime import files, precompile, processes
 
 _PEAK = "peak_bytes_in_use"  # for a device's statistics, which a CPU does not have
 _WAYS = {
     "dagger": finetune_stages.Imitation,
-    "self": finetune_stages.Imitation,
     "rl": finetune_rl.PolicyGradient,
     "distill": finetune_distill.Distillation,
 }
 
 
 def run(
-    settings: FinetuneConfig, path: policy_args.PolicyPath, started: session.Session, share: Any
+    settings: FinetuneConfig, path: policy_args.PolicyPath, started: session.Session, share: Share
 ) -> None:
     """Completes a fine-tuning.
 
@@ -84,7 +85,7 @@ def _plan(work: Work) -> str:
             f"{steps}, demonstrations, and as many states of the episodes",
         ),
     }
-    played, trained = work_of_round.get(settings.by, work_of_round["dagger"])
+    played, trained = work_of_round[settings.by]
     return "\n".join(
         [
             f"starjax {starjax.__version__}: {label} of {name}, fine-tuned by {settings.by}, "
@@ -136,7 +137,7 @@ def _keep(
     print(f"\npolicy: {work.out / 'policy.safetensors'}, {kept}; figures: {path}", flush=True)
 
 
-def _score(work: Work, name: str, who: Any) -> dict[str, Any]:
+def _score(work: Work, name: str, who: PolicyInEnv) -> dict[str, Any]:
     """Returns the success of a policy at seen and unseen trocars, and its RCM error."""
     print(f"\n[report] {name}", flush=True)
     folder, settings = work.out / name, work.settings

@@ -1,7 +1,6 @@
 """Episodes in which a person relieved a policy, as `starjax finetune` takes them."""
 
 from pathlib import Path
-from typing import Any
 
 from starjax.addons.finetune import dagger
 from starjax.addons.finetune.settings import FinetuneConfig
@@ -9,11 +8,12 @@ from starjax.core import errors
 from starjax.data import store
 from starjax.rcm.trocar import Trocar
 from starjax.rollouts import takeover
+from starjax.sim.state import Env
 
 _FLAG = "--interventions"
 
 
-def find(settings: FinetuneConfig, env: Any, seen: Trocar) -> Path:
+def find(settings: FinetuneConfig, env: Env, seen: Trocar) -> Path:
     """Returns the folder of the settings' interventions.
 
     Args:

@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from starjax.cli import checks, folders, options
 from starjax.core import config as config_lib
@@ -11,6 +11,9 @@ from starjax.core import errors
 from starjax.core.limits import Range
 from starjax.policies import packaged
 from starjax.runtime import hub, jax_start, signals, xla
+
+if TYPE_CHECKING:  # for annotations alone
+    import viser
 
 DESCRIPTION = """Shows a policy, an expert, a dataset or recorded trials on a page in the browser.
 
@@ -108,7 +111,7 @@ def _recorded(args: ViewArgs) -> Show:
     _expect_scene(args, agent.task)
     env, policy = shared_control.relieved(agent.file, (args.arm,) if args.arm else ())
 
-    def show(server: Any, should_stop: Callable[[], bool]) -> str:
+    def show(server: "viser.ViserServer", should_stop: Callable[[], bool]) -> str:
         with recorder.record_into(Path(args.record), env, args.seed, policy) as kept:
             steering = recorder.steer(env, policy)
             summary = relief.run(

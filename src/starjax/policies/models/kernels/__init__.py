@@ -3,7 +3,8 @@
 One file holds one variant. Its first lines name the reference that it equals, and its function
 `pays` decides from the device and the shapes if it is used; tests/policies/models/kernels compares
 the two.
-`choose` is the only door: to drop a variant, delete its file and its line of `VARIANTS`.
+`choose` is the only door: to drop a variant, delete its file and its line of `VARIANTS`. Add-ons
+bring others, as parts of the kind `variant`.
 """
 
 import importlib
@@ -12,16 +13,16 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
 
+from starjax.core import extensions
+
 Reference = TypeVar("Reference")
 
 # part of a network: "module:name" of its variant  # use
 VARIANTS = {
-    "sum_of_positions": "channel_sums:in_two_steps",  # biases' gradients; training on a GPU
-    "convolve": "few_images:convolution",  # products of one or two images; decisions on a GPU
-    "pack": "packed_params:pack",  # vectors in one array; training and decisions on a GPU
-    "ddim_sample": "parallel_ddim:ddim_sample",  # steps side by side; few robots on a GPU
-    "NormReluPool": "pooled_norm:PooledNorm",  # one gradient for all three; everywhere
-    "fuse_unet": "sampling_unet:prepared",  # a U-Net's block in two kernels; decisions on a GPU
+    "sum_of_positions": f"{__name__}.channel_sums:in_two_steps",  # biases' gradients; on a GPU
+    "pack": f"{__name__}.packed_params:pack",  # vectors in one array; on a GPU
+    "NormReluPool": f"{__name__}.pooled_norm:PooledNorm",  # one gradient for all three; everywhere
+    **extensions.parts("variant"),
 }
 
 
@@ -38,14 +39,14 @@ def choose(part: str, reference: Reference, *size: Any) -> Reference:
     """Returns the variant of a part that is faster here, else the reference.
 
     Args:
-      part: of `VARIANTS`.
+      part: name of the part.
       reference: function or module, used if there is no variant or it does not pay.
       *size: arguments of the variant's `pays`.
     """
     if part not in VARIANTS:
         return reference
     module, name = VARIANTS[part].split(":")
-    variant = importlib.import_module(f"{__name__}.{module}")
+    variant = importlib.import_module(module)
     return getattr(variant, name) if variant.pays(*size) else reference
 
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import recorded
 
-from starjax.cli import inspect_page
+from starjax.addons.viewer import dataset_page, recording_figures, recording_page
 from starjax.data import recordings
-from starjax.report import recording_figures, recording_page
 
 HZ = 30.0
 
@@ -93,5 +92,5 @@ def test_the_page_shows_images_of_every_camera_side_by_side():
 def test_a_dataset_has_a_page(tmp_path):
     recorded.write(tmp_path / "ours")
     page = tmp_path / "page.html"
-    inspect_page.write(tmp_path / "ours", "", page, [("dataset", "ours")], [])
+    dataset_page.write(tmp_path / "ours", "", page, [("dataset", "ours")], [])
     assert "data:image/png" in page.read_text()

@@ -11,7 +11,9 @@ from gymnasium.vector import AutoresetMode
 from scipy.spatial.transform import Rotation
 
 from starjax import rcm
-from starjax.envs import batch, exported, forked, on_device, settings, vector
+from starjax.addons.formats import exported
+from starjax.addons.playground import on_device
+from starjax.envs import batch, forked, settings, vector
 from starjax.sim import env as sim_env
 
 LANES = 3

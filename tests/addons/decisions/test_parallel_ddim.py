@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from starjax.addons.decisions import parallel_ddim
 from starjax.policies.models import diffusion, kernels, schedule
-from starjax.policies.models.kernels import parallel_ddim
 
 SCHEDULE = schedule.cosine(100)
 NOISE = jnp.asarray(np.random.default_rng(0).normal(size=(2, 16, 4)), jnp.float32)

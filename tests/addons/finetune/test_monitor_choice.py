@@ -5,7 +5,7 @@ import types
 import numpy as np
 import pytest
 
-from starjax.policies.monitor import calibrate, scores
+from starjax.policies.monitor import record, scores
 
 SETTINGS = scores.ScoreSettings(execute=8, control_hz=30.0, still=3)
 STILLNESS, CLOSURE, PROGRESS = map(scores.NAMES.index, ("stillness", "closure", "progress"))
@@ -58,5 +58,5 @@ def test_the_halves_share_no_trocar(choice):
 def test_levels_of_scores_raise_no_more_than_their_sum(choice):
     rng = np.random.default_rng(1)
     monitor = choice.by_score(table(rng, 800), 0.1, SETTINGS, "weights", scores.CALIBRATED)
-    times, _ = calibrate.first_alarms(monitor, table(rng, 2000).scores)
+    times, _ = record.first_alarms(monitor, table(rng, 2000).scores)
     assert 0.03 < np.isfinite(times).mean() < 0.1

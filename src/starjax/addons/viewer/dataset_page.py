@@ -10,8 +10,6 @@ from starjax.runtime import files
 if TYPE_CHECKING:
     import numpy as np
 
-    from starjax.data.recordings import EpisodeMotion
-
 _MOMENTS = 6  # images of an episode
 
 
@@ -37,8 +35,8 @@ def write(
       errors.UsageError: no mapping fits, or no motion is left.
     """
     extras.require("inspect --page", "report")
+    from starjax.addons.viewer import recording_page
     from starjax.data import recordings
-    from starjax.report import recording_page
 
     notes: list[str] = []
     images: dict[str, np.ndarray] = {}
@@ -46,18 +44,13 @@ def write(
         found = list(recordings.of_dataset(path))
         images = _images(path, image_size) if image_size else {}
     else:
-        found, notes = mapped(path, map_name)
+        found, notes = extensions.hook("inspect_page")(path, map_name)
     if not found:
         raise errors.UsageError("PATH", "episodes with motions", f"none in {path}")
     notes = list(dict.fromkeys([*odd, *notes]))
     text = recording_page.render(path.name, rows, found, notes, images)
     files.write_bytes(page, text.encode())
     return notes
-
-
-def mapped(path: Path, map_name: str) -> "tuple[list[EpisodeMotion], list[str]]":
-    """Returns the first motions of another project's dataset, and the notes of its import."""
-    return extensions.hook("inspect_page")(path, map_name)
 
 
 def _images(path: Path, size: int) -> "dict[str, np.ndarray]":

@@ -4,12 +4,15 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from starjax.cli import checks, options, policy_args, session
 from starjax.core import config as config_lib
 from starjax.core import errors
 from starjax.core.limits import Positive, Range
+
+if TYPE_CHECKING:  # for annotations alone
+    from starjax.policies.in_env import PolicyInEnv
 
 DESCRIPTION = """Calibrates a runtime monitor and writes the policy with it to a new file.
 
@@ -44,10 +47,11 @@ def main(argv: Sequence[str]) -> int:
     )
     started = session.start("calibrate", argv, folder)
 
+    from starjax.addons.finetune import calibration
     from starjax.cli import policy_evaluation
     from starjax.evaluation import alarms, sweep, trials
     from starjax.policies import policy_file
-    from starjax.policies.monitor import calibrate
+    from starjax.policies.monitor import record
 
     who, _ = policy_args.load(path)
     settings = _score_settings(args, who)
@@ -63,16 +67,16 @@ def main(argv: Sequence[str]) -> int:
         if share.is_first:
             stored = policy_file.load(path.file)
             assert table.scores is not None
-            fits, calibrates, tests = calibrate.parts(len(table.trial))
+            fits, calibrates, tests = calibration.parts(len(table.trial))
             fitted, successes = (table.scores[table.success & part] for part in (fits, calibrates))
             test = trials.select(table, tests)
             digest = policy_file.monitor_digest(stored.params)
-            monitor = calibrate.calibrate(fitted, successes, args.alpha, settings, digest)
+            monitor = calibration.calibrate(fitted, successes, args.alpha, settings, digest)
             out, is_half = Path(args.out), policy_file.is_half(stored.params)
             policy_file.save(out, stored._replace(monitor=monitor), half=is_half)
             figures = alarms.compose(test, monitor)
             content = {"policy": path.file.name, "weights": who.weights, "seed": args.seed}
-            content |= {"monitor": calibrate.to_json(monitor), "test": figures}
+            content |= {"monitor": record.to_json(monitor), "test": figures}
             started.write("monitor.json", content)
             print(_outcome(monitor, figures))
             print(f"\npolicy: {out}; figures: {folder / 'monitor.json'}")
@@ -95,7 +99,7 @@ def _parse(
     return args, path, path.folder("calibrate", [trials])
 
 
-def _score_settings(args: CalibrateArgs, who: Any) -> Any:
+def _score_settings(args: CalibrateArgs, who: "PolicyInEnv") -> Any:
     from starjax.policies.monitor.scores import ScoreSettings
 
     execute, control_hz = who.trained.policy.execute, who.env.control_hz

@@ -25,9 +25,9 @@ from starjax.data import pose_rows
 from starjax.data.pose_rows import ACTIONS
 from starjax.envs import batch, forked, mdp, settings, vector
 from starjax.sim import wrists
+from starjax.sim.state import EnvState
 from starjax.sim.task import Task
 
-_WIDTH = {"pose": pose_rows.COLUMNS, "rcm4": rcm.ACTION_SPACES["rcm4"].dim + 1}
 _MATRIX = 13  # numbers of an arm in the compiled program: p, R, gripper
 IMAGE = "pixels/"
 
@@ -137,16 +137,16 @@ def sizes(task: Task, actions: str, trocar_in_state: bool) -> tuple[dict[str, in
     """
     errors.choice("actions", actions, ACTIONS)
     state = pose_rows.COLUMNS + 3 * trocar_in_state
-    return {"agent_pos": state * task.arms, "trocar": 3 * task.arms}, _WIDTH[actions] * task.arms
+    return {"agent_pos": state * task.arms, "trocar": 3 * task.arms}, ACTIONS[actions] * task.arms
 
 
 def _episodes(chosen: settings.EnvSettings, actions: str) -> mdp.Episodes:
     """Returns the task's episodes with unscaled poses as observations and commands."""
     made = mdp.make(chosen)
     env, arms = made.env, made.env.task.arms
-    width = _MATRIX if actions == "pose" else _WIDTH[actions]
+    width = _MATRIX if actions == "pose" else ACTIONS[actions]
 
-    def step(state: Any, action: jax.Array) -> Any:
+    def step(state: EnvState, action: jax.Array) -> Any:
         rows = action.reshape(arms, width)
         if actions == "rcm4":
             pose, _ = rcm.ACTION_SPACES["rcm4"].decode(rows[:, :-1], state.measured_trocar)
@@ -157,7 +157,7 @@ def _episodes(chosen: settings.EnvSettings, actions: str) -> mdp.Episodes:
         command = wrists.through(env.task, command, state.measured_trocar.p_world_trocar)
         return env.step(state.replace(done=is_over), command)
 
-    def observe(state: Any) -> dict[str, jax.Array]:
+    def observe(state: EnvState) -> dict[str, jax.Array]:
         seen = env.observe(state)
         named = {"p": seen.pose.p, "R": seen.pose.R, "gripper": seen.gripper}
         named["trocar"] = state.measured_trocar.p_world_trocar

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from starjax.addons.decisions import sampling_unet
 from starjax.policies.models import kernels, unet1d
-from starjax.policies.models.kernels import sampling_unet
 
 GROUPS = 4
 

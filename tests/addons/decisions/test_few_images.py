@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from starjax.addons.decisions import few_images
 from starjax.policies.models import kernels, resnet
-from starjax.policies.models.kernels import few_images
 
 
 def normal(*shape):

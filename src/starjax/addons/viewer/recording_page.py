@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from starjax.addons.viewer import recording_figures
 from starjax.data import recordings
 from starjax.data.recordings import EpisodeMotion, MotionFigures
-from starjax.report import formats, page, recording_figures, style
+from starjax.report import formats, page, style
 from starjax.report.formats import Table
 from starjax.report.sections import Card
 

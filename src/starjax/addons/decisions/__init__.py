@@ -1,0 +1,1 @@
+"""Networks of decisions in fewer GPU kernels, for one or a few robots."""
