@@ -290,7 +290,7 @@ def test_a_command_out_of_reach_is_not_sent(own_bus, tmp_path):
         process.end()
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_ten_minutes_of_a_redundant_arm_do_not_drift(own_bus, tmp_path):
     """Joints of a seven-joint arm after 150 rounds are those after the first few."""
     kin = kinematics.of("panda", "grasper", "peg_transfer")
