@@ -41,7 +41,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
     if nextitem is None or nextitem.path == item.path:
         return
-    statm = pathlib.Path("/proc/self/statm")  # of Linux
+    statm = pathlib.Path("/proc/self/statm")  # Linux only
     pages = int(statm.read_text().split()[1]) if statm.exists() else 0
     if pages * mmap.PAGESIZE > MEMORY:
         jax.clear_caches()
