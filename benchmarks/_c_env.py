@@ -19,7 +19,7 @@ from starjax.sim.env import Env
 from starjax.sim.scene import Scene
 from starjax.sim.task import Contacts
 
-ITERATIONS = 50  # of C MuJoCo's solver: the models' own are those of `sim.solver`
+ITERATIONS = 50  # iterations of C MuJoCo's solver: the models' own are those of `sim.solver`
 # Contacts that touch and measurements may see: two tools on a needle have up to 50. Our own physics
 # keeps fewer, the nearest.
 CONTACTS = 64

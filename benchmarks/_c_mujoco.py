@@ -37,7 +37,7 @@ def home(scene: Scene) -> jax.Array:
 
 
 def steps_per_s(scene: Scene) -> float:
-    """Physics steps a second of our model from `at_rest`."""
+    """Physics steps per second of our model from `at_rest`."""
     data = mujoco.MjData(scene.mj_model)
     data.qpos[:] = np.asarray(at_rest(scene).qpos)
     data.ctrl[:] = np.asarray(home(scene))

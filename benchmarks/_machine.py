@@ -13,7 +13,7 @@ AGAIN = 10  # products, or copies, in one call
 
 
 class Rates(NamedTuple):
-    """FLOP/s of a product in `dtype`; bytes/s of a copy, what is read and written both counted."""
+    """FLOP/s of a product in `dtype`; bytes/s of a copy, reads and writes counted."""
 
     flops: float
     bandwidth: float
@@ -40,7 +40,7 @@ def measure(dtype: str) -> Rates:
     # Random, as a product of ones or zeros draws less power and runs faster than real ones.
     a = jax.random.normal(jax.random.key(0), (n, n)).astype(dtype)
     x = jnp.ones(count)
-    # Many in a call, so that a rate does not hold what the call costs.
+    # Many in a call: the call's own time vanishes in the rate.
     product = _timing.time_jitted(lambda a: _again(lambda b: a @ b / n, a), a, repeats=5)
     copy = _timing.time_jitted(lambda x: _again(lambda y: y + 1.0, x), x, repeats=5)
     return Rates(AGAIN * 2 * n**3 / product.min_s, AGAIN * 2 * x.nbytes / copy.min_s, dtype)

@@ -1,4 +1,4 @@
-"""Peers in processes of their own: PyTorch beside ours, on the same device, one after the other."""
+"""Peers in processes of their own: PyTorch and ours, on the same device, in turn."""
 
 import argparse
 import json
@@ -25,14 +25,14 @@ def add_flag(parser: argparse.ArgumentParser) -> None:
 
 
 def platform() -> str:
-    """`gpu` or `cpu`, told without starting jax, which would take the memory a peer needs."""
+    """`gpu` or `cpu`, known without starting jax, which would take the memory a peer needs."""
     return "gpu" if gpu.is_likely() else "cpu"
 
 
 def ask(python: str | None, *arguments: str | int, tiny: bool = False) -> dict[str, Any]:
     """What `peer_torch.py` prints, and `start_to_first_call_s` since the start of its process.
 
-    {} where no peer was asked for, and, after a line that says why, where it cannot run.
+    {} without a requested peer and, after a line with the reason, if it cannot run.
     """
     if python is None:
         return {}

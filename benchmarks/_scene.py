@@ -10,12 +10,12 @@ from starjax.sim import names, scene
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """`--task`, `--arm` and `--tool`."""
     parser.add_argument("--task", default="peg_transfer", help="of the registry")
-    parser.add_argument("--arm", nargs="+", default=[], help="one for each slot, or one for all")
-    parser.add_argument("--tool", nargs="+", default=[], help="one for each slot, or one for all")
+    parser.add_argument("--arm", nargs="+", default=[], help="one per slot, or one for all")
+    parser.add_argument("--tool", nargs="+", default=[], help="one per slot, or one for all")
 
 
 def make(asked: argparse.Namespace, **settings: Any) -> envs.Env:
-    """The environment that the flags ask for; `settings` are those of `env.make`."""
+    """The environment of the flags; `settings` are those of `env.make`."""
     return envs.make(asked.task, asked.arm, asked.tool, **settings)
 
 

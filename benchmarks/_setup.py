@@ -59,7 +59,7 @@ class Job(NamedTuple):
     Attributes:
       policy: being trained.
       params: shapes of its parameters, as the networks take them.
-      carry: what goes from call to call, on all devices.
+      carry: state from call to call, on all devices.
       dataset: made-up frames on all devices.
       example: a batch.
       steps: (carry, dataset, count) -> carry after `per_call` steps.
@@ -152,7 +152,7 @@ def drawn(policy: policies.Policy, seed: int = 0) -> policies.Params:
 
 
 def statistics(policy_config: PolicyConfig) -> normalizer.Normalizer:
-    """Of commands that are in [-1, 1] already."""
+    """For commands that are in [-1, 1] already."""
     box = normalizer.MinMax(-jnp.ones(5), jnp.ones(5))
     wide = normalizer.MinMax(-jnp.ones(TASK.state_size), jnp.ones(TASK.state_size))
     return normalizer.Normalizer(box, wide if policy_config.observation == "state" else None)
@@ -160,9 +160,9 @@ def statistics(policy_config: PolicyConfig) -> normalizer.Normalizer:
 
 @functools.lru_cache(maxsize=1)
 def made_up(policy_config: PolicyConfig, count: int) -> windows.Dataset:
-    """One long demonstration on the device; what is in it does not change the time.
+    """One long demonstration on the device; its values do not change the time.
 
-    Made by numpy: no program is compiled for what a training reads from a disk.
+    Made by numpy: no program is compiled for data from a disk.
     """
     images = state = None
     if policy_config.observation == "image":

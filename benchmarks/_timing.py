@@ -1,7 +1,7 @@
-"""What every benchmark shares: how a time is taken, and what a result file says beside it.
+"""Parts of every benchmark: measurement of a time, provenance of a result file.
 
 A time is the median of repeated calls, each waited for; compilation is timed apart, and a peer
-is timed in the same process, so that a ratio means something on a busy or a slow machine.
+is timed in the same process, so a ratio means something on a busy or a slow machine.
 """
 
 import json
@@ -27,8 +27,8 @@ class Timing(NamedTuple):
     Attributes:
       compile_s: ahead-of-time compilation (or reading it from the persistent cache), seconds.
       median_s: of one call, over the repeats; min_s: the fastest.
-      temporary_bytes: the compiler's scratch memory, beside inputs and results.
-      result_bytes: its results, where they do not reuse an input's memory.
+      temporary_bytes: the compiler's scratch memory, without inputs and results.
+      result_bytes: its results that do not reuse an input's memory.
       cores: CPU time of this process over wall time. A program of several threads is slower where
         others take the cores: times of different numbers do not compare.
     """
@@ -117,10 +117,10 @@ def rounded(value: Any) -> Any:
 
 
 def write(name: str, results: dict[str, Any]) -> pathlib.Path:
-    """Write `results/<name>_<backend>.json`: what was found, with what code, command and machine.
+    """Write `results/<name>_<backend>.json`: figures, with code, command and machine.
 
     Rows (`results["results"]`) measured before with the same versions on the same kind of device,
-    of a CPU the same number of the same cores, stay, so that a benchmark may be run row by row;
+    of a CPU the same number of the same cores, stay: a benchmark may be run row by row;
     `made` has the code and command of each.
     """
     path = RESULTS / f"{name}_{jax.default_backend()}.json"

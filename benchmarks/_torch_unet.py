@@ -1,6 +1,6 @@
 """The U-Net in PyTorch, as fast as we could write it there; see `starjax.policies.models.unet1d`.
 
-Over `[B, L, C]`, convolutions as matrix products, taps that only meet padding left out, the
+Over `[B, L, C]`, convolutions as matrix products, without taps that only meet padding, the
 condition's part of FiLM apart: the same function and the same parameters as ours.
 """
 

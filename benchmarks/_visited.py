@@ -14,8 +14,8 @@ from starjax.sim import env as envs
 from starjax.sim.quiet_mjx import mjx
 from starjax.sim.scene import Scene
 
-STEPS = 240  # control steps an episode, 8 s, so most states hold contacts
-CPU_LANES = 16  # of a program that has a CPU to itself: enough to share its operations out
+STEPS = 240  # control steps per episode, 8 s, so most states hold contacts
+CPU_LANES = 16  # lanes of a program that has a CPU to itself: enough to share its operations out
 
 Step = Callable[[mjx.Model, mjx.Data], mjx.Data]
 

@@ -1,12 +1,12 @@
-"""Collecting demonstrations: 240 of them, 256 x 256 pixels, 30 Hz; and what it waits for.
+"""Collecting demonstrations: 240 of them, 256 x 256 pixels, 30 Hz; and its waits.
 
     python benchmarks/bench_collect.py [--image 256] [--per-trocar 30] [--folder DIR] [--tiny]
 
 `demos.collect` at the eight seen trocars, as `starjax collect` calls it, with programs that have
 run one segment before the clock starts: compilation is timed apart. Simulating, copying pictures to
-the host and writing overlap; its time is divided by what it, or each of a CPU's cores, waited for.
-Beside it: one thread of C MuJoCo doing the physics steps alone, and a plain sequential write of the
-same bytes with fsync in the same folder.
+the host and writing overlap; its time is divided by the waits, of each core on a CPU.
+Compared with one thread of C MuJoCo doing the physics steps alone, and a plain sequential write
+of the same bytes with fsync in the same folder.
 """
 
 import argparse
@@ -96,7 +96,7 @@ def collect(
     expert: agent.BatchAgent,
     asked: argparse.Namespace,
 ) -> dict:
-    """Collects with programs that are compiled; how long it took, and for what it waited."""
+    """Collects with programs that are compiled; its time and its waits."""
     begun, segments, fetches = [], [], []  # s; appended to by all threads
     fetch, chunks = fetching.fetch, []
 

@@ -28,9 +28,9 @@ from starjax import runtime
 from starjax.sim import env as envs
 from starjax.sim.scene import Scene
 
-PAIRS = 4  # of the broad phase: `max_geom_pairs` of the needle's MJCF
+PAIRS = 4  # limit of the broad phase: `max_geom_pairs` of the needle's MJCF
 NEEDLE = "needle"
-POINTS = 4  # of a pad, in place of all its contacts
+POINTS = 4  # points of a pad, in place of all its contacts
 
 
 class Point(NamedTuple):
@@ -215,7 +215,7 @@ def _moments(data: Any, contacts: list[tuple[int, int]]) -> dict[int, Point]:
         # Depth as an affine function of the place in the face: same sums and first moments.
         inside = np.column_stack([np.ones(len(rows)), (points - middle) @ axes[:2].T])
         depth, *_ = np.linalg.lstsq(inside, dist, rcond=None)
-        sigma = spread[:2] * np.sqrt(2.0 / len(rows))  # of four points: two along each axis
+        sigma = spread[:2] * np.sqrt(2.0 / len(rows))  # set of four points: two along each axis
         for k, (x, y) in enumerate(((1, 0), (-1, 0), (0, 1), (0, -1))):
             place = np.array([x * sigma[0], y * sigma[1]])
             at = float(depth @ [1.0, *place])

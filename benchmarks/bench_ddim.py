@@ -5,7 +5,7 @@
         [--ddim-steps 100]
 
 A policy plans at frames of demonstrations that it did not learn from, each way with the same noise;
-beside it, what calculating in bfloat16 instead of float32 moves, step after step and side by
+with it, the difference of bfloat16 from float32, step after step and side by
 side. No time is measured here: bench_inference.py does that.
 """
 
@@ -43,7 +43,7 @@ def main() -> None:
     parser.add_argument("--ddim-steps", type=int, help="by default the policy's")
     asked = parser.parse_args()
     runtime.prepare_xla()
-    # a GPU would calculate with ten bits where float32 is said
+    # a GPU would calculate with ten bits in float32
     jax.config.update("jax_default_matmul_precision", "highest")
     trained = policy_file.load(packaged.locate(asked.policy))
     given = {"temperature": asked.temperature, "ddim_steps": asked.ddim_steps}
@@ -83,7 +83,7 @@ def planned(
     policy = policies.make(method, settings, task, trained.train, trained.scene.cameras)
     keys = jax.random.split(jax.random.key(1), FRAMES)
     given = (trained.params, trained.normalizer, keys, batch.observation, batch.trocar)
-    # what a policy takes for so many robots
+    # inputs of a policy for so many robots
     with mock.patch.object(diffusion, "ddim_sample", ddim_sample):
         return jax.jit(policy.sample)(*given)
 

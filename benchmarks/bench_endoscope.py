@@ -4,7 +4,7 @@
 
 Both draw the same scene inside one program each, as collection and evaluation do: a scan of steps
 over a batch of environments, shadows on, poses a batch axis. They are timed in turns, in one
-process, so that the ratio means something on a busy machine. What the endoscope sees is another
+process, so the ratio means something on a busy machine. What the endoscope sees is another
 picture: the third row draws the fixed camera's own picture by way of a pose.
 """
 
@@ -27,7 +27,7 @@ TURNS = 41
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sizes", type=int, nargs="+", default=(128,), help="pixels a side")
+    parser.add_argument("--sizes", type=int, nargs="+", default=(128,), help="side in pixels")
     parser.add_argument("--batch", type=int, default=bench_render.BATCH[_peer.platform()])
     asked = parser.parse_args()
     runtime.prepare_xla()

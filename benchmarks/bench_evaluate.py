@@ -3,9 +3,9 @@
     python benchmarks/bench_evaluate.py [--image 256] [--policy FILE] [--trials 30] [--tiny]
 
 Without `--policy` an untrained policy is run: nothing ends early, so this is the worst case. With
-one, a trial ends when the block stands on its peg, and what is compared ends there too. The
+one, a trial ends when the block stands on its peg, and its comparison ends there too. The
 programs are those of `starjax evaluate`, on as many trials at once, a CPU's cores side by side;
-compiling them is timed apart, by a trial that is over before it begins. Beside it: what C MuJoCo on
+compiling them is timed apart, by a trial that is over before it begins. Compared with C MuJoCo on
 one thread would need for the physics steps alone, and, as the floor, the sum of the parts timed one
 by one in this process (on a CPU each has all cores, so less is possible).
 """
@@ -35,7 +35,7 @@ from starjax.sim import env as envs
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     side = 256 if _peer.platform() == "gpu" else 0
-    parser.add_argument("--image", type=int, default=side, help="pixels a side; 0: task state")
+    parser.add_argument("--image", type=int, default=side, help="side in pixels; 0: task state")
     parser.add_argument("--policy", help="a policy.safetensors, or the name of a packaged one")
     parser.add_argument("--trials", type=int, default=30, help="a trocar")
     parser.add_argument("--limit", type=float, default=60.0, help="s, of a trial")
@@ -134,7 +134,7 @@ def over_at_once(env: envs.Env) -> list[episodes.Trial]:
 def runner(env, policy, settings, max_steps: int, lanes: int, devices=None) -> engine.Run:
     """The programs of an evaluation.
 
-    Beside the task's configurations of trocars there is one that is nowhere, see `over_at_once`.
+    One more configuration of trocars has no place, see `over_at_once`.
     """
     nowhere = np.full((1, env.task.arms), np.nan, np.float32)
     trocars = rcm.Trocar(*(np.concatenate([field, nowhere]) for field in env.task.trocars))

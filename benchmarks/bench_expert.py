@@ -34,7 +34,7 @@ from starjax.sim import env as envs
 from starjax.sim import registries, sampling
 
 STEPS = 600  # control steps, 20 s, that demonstrations may take too
-# Rows of --all beside each expert with its task's own arms and tools: task, arm, tool, expert.
+# Rows of --all, apart from each expert with its task's own arms and tools: task, arm, tool, expert.
 OTHERS = [
     *[("peg_transfer", arm, "", "default") for arm in ("ur5e", "panda", "iiwa14", "rcm4")],
     *[("peg_transfer", arm, "needle_driver", "default") for arm in ("fr5", "psm", "psm_si")],

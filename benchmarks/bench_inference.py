@@ -2,10 +2,10 @@
 
     python benchmarks/bench_inference.py [--only "224 px"] [--peer [PYTHON]] [--tiny]
 
-On a GPU: the paper's model from pictures, at batch 1 and 360, beside PyTorch and the floor: the
+On a GPU: the paper's model from pictures, at batch 1 and 360, against PyTorch and the floor: the
 larger of its arithmetic and of its weights in the networks' type, the U-Net's read once for each of
 its evaluations, FiLM's and the encoder's once a call. On a CPU: a small model of the task's state,
-for every count of DDIM steps, beside numpy doing nothing but the matrix products of the same call
+for every count of DDIM steps, against numpy with the matrix products of the same call
 on the same cores.
 """
 
@@ -137,7 +137,7 @@ def measure(case: _setup.Case, batch: int, rates: _machine.Rates, seconds: float
 
 
 def weights_read(params: policies.Params, policy_config, evaluations: int) -> float:
-    """Bytes: what each evaluation of the U-Net needs again, and what is needed once."""
+    """Bytes: those of each evaluation of the U-Net, and those needed once."""
     total = 0
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         name = jax.tree_util.keystr(path)

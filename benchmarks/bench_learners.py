@@ -2,7 +2,7 @@
 
     python benchmarks/bench_learners.py [--only flow] [--tiny]
 
-All with the encoder, the sizes and the training of preset `compact`, from pictures, untrained: what
+All with the encoder, the sizes and the training of preset `compact`, from pictures, untrained: the
 is in the weights does not change the time. `diffusion` is the peer in the same run.
 """
 

@@ -19,7 +19,7 @@ from starjax.policies import policy as policies
 from starjax.policies.monitor import record, scores, watch
 from starjax.sim import registries
 
-UPDATES = 150  # of an episode, 40 s
+UPDATES = 150  # decisions of an episode, 40 s
 STILL = 6  # decisions of the window of stillness
 
 

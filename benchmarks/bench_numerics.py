@@ -3,7 +3,7 @@
     python benchmarks/bench_numerics.py [--steps 500] [--crop 96] [--tiny]
 
 Parameters, statistics and losses are float32 in both; only the networks' arithmetic differs. The
-losses are smoothed by an exponential average over 50 steps, since each is a draw of noise; beside
+losses are smoothed by an exponential average over 50 steps, since each is a draw of noise; against
 their largest relative difference stands that of two float32 runs with other seeds, which is how far
 apart curves run that differ in nothing that matters.
 """

@@ -141,7 +141,7 @@ def largest_gap(ours, vectorised, one_by_one) -> float:
 def numpy_frame(
     name: str, trocar: rcm.Trocar, p_world_ref: np.ndarray
 ) -> tuple[str, np.ndarray, np.ndarray]:
-    """Name of the action space but for its frame's yaw, R_world_trocar `[..., 3, 3]`, and
+    """Name of the action space without its frame's yaw, R_world_trocar `[..., 3, 3]`, and
     p_world_trocar `[..., 3]`."""
     r, theta, phi = trocar
     c, s, o = np.cos(phi), np.sin(phi), np.zeros_like(phi)

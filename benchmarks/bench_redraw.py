@@ -63,7 +63,7 @@ def main() -> None:
         draw = both.draw if name == "look" else env.draw
         runs[name] = make(case, names, dataset, draw)
         runs[name](steps)  # compiles
-        # The cases grow, and each starts from what the others hold: its peak is the highest.
+        # The cases grow, and each starts from the memory of the others: its peak is the highest.
         bytes_used[name] = memory("peak_bytes_in_use") - before
     seconds: dict[str, list[float]] = {name: [] for name in runs}
     for _ in range(rounds):
@@ -120,7 +120,7 @@ def make(case: _setup.Case, names: tuple[str, ...], dataset: Any, draw: Any) -> 
 
 
 def memory(name: str) -> int:
-    """Returns a number of the device's memory statistics, 0 on a CPU, which has none."""
+    """Returns a number of the device's memory statistics, 0 on a CPU."""
     return (jax.devices()[0].memory_stats() or {}).get(name, 0)
 
 

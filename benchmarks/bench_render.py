@@ -4,7 +4,7 @@
 
 Ours draw inside one program, as collection and evaluation do: a scan of steps over a batch of
 environments, shadows on. The C renderer draws the same poses one by one in a process of its own.
-The floor is what writing the finished pictures takes at the rate of a large copy; the memory of a
+The floor is the time of writing the finished pictures at the rate of a large copy; the memory of a
 picture is the compiler's scratch space over the pictures that are drawn at once.
 """
 
@@ -35,7 +35,7 @@ STEPS = 4
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="pixels a side")
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="side in pixels")
     parser.add_argument("--batch", type=int, default=BATCH[_peer.platform()])
     asked = parser.parse_args()
     batch = asked.batch
@@ -113,7 +113,7 @@ def program(mj_model: mujoco.MjModel, size: int):
 
 
 def c_rate(mj_model: mujoco.MjModel, qpos: np.ndarray, size: int) -> float | None:
-    """Pictures per second of MuJoCo's own renderer; None where there is no GL."""
+    """Pictures per second of MuJoCo's own renderer; None without GL."""
     with tempfile.TemporaryDirectory() as folder:
         files = [f"{folder}/{name}" for name in ("model.mjb", "qpos.npz", "out.npz")]
         mujoco.mj_saveModel(mj_model, files[0], None)

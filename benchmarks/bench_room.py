@@ -1,4 +1,4 @@
-"""Physics steps a second of a needle in the jaws, with the scene's room for contacts and with more.
+"""Physics steps per second of a needle in the jaws, with the scene's contacts and with more.
 
     python benchmarks/bench_room.py [--task needle_pick] [--tiny]
 

@@ -28,7 +28,7 @@ from starjax.runtime import processes
 from starjax.sim import env as envs
 
 BATCH = 256  # a device
-LANES = {"gpu": 360, "cpu": 4}  # trials a device
+LANES = {"gpu": 360, "cpu": 4}  # trials per device
 LIMIT_S = 4.0  # simulated, of a trial
 
 
@@ -87,7 +87,7 @@ def train(count: int, tiny: bool) -> dict:
 
 
 def evaluate(count: int, tiny: bool) -> dict:
-    """An evaluation of `LANES` trials a device that all run to the limit."""
+    """An evaluation of `LANES` trials per device that all run to the limit."""
     platform = _peer.platform()
     case = _setup.paper(96) if platform == "gpu" and not tiny else _setup.miniature()
     policy, params, stats = _setup.untrained(case)

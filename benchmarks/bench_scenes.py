@@ -1,4 +1,4 @@
-"""Physics steps a second of every scene, beside C MuJoCo on one thread, and two arms beside one.
+"""Physics steps per second of every scene, against C MuJoCo on a thread; two arms against one.
 
     python benchmarks/bench_scenes.py [--batches 360 4096] [--only reach needle_pick] [--peer]
 

@@ -22,7 +22,7 @@ from starjax import deploy, rcm, runtime
 from starjax.deploy import batching, wire
 from starjax.deploy.connection import Connection
 
-LOOP_S = 10.0  # of the robot
+LOOP_S = 10.0  # time of the robot
 DOMAIN = 77  # DDS domain
 LOST_S = 0.5  # after which a command counts as lost: another has replaced it
 

@@ -1,11 +1,11 @@
-"""Physics steps a second at several batch sizes, beside C MuJoCo on one thread and MJX's own step.
+"""Physics steps per second at several batch sizes, against C MuJoCo (one thread) and MJX's step.
 
     python benchmarks/bench_sim.py [--batches 360 4096 16384] [--peer] \\
         [--task peg_transfer] [--arm fr5]
 
 At rest (arms at home, objects where an episode begins) and at work: states of the scripted expert's
 episodes, with the jaws closing. `--peer` also times `mjx.step`, whose contact solver is MJX's, from
-the same states. A CPU steps a batch 16 at a time, with threads: what else runs there shows in the
+the same states. A CPU steps a batch 16 at a time, with threads: other work shows in the
 cores that it got.
 """
 
@@ -25,7 +25,7 @@ from starjax.sim.quiet_mjx import mjx
 from starjax.sim.scene import Scene
 
 STEPS = 64  # physics steps a call
-EPISODES = 48  # of the expert, from which states are drawn
+EPISODES = 48  # episodes of the expert, from which states are drawn
 BATCHES = {"cpu": [1, 16, 256], "gpu": [360, 4096, 16384]}
 
 

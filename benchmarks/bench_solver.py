@@ -1,9 +1,9 @@
-"""Error and speed of one physics step in float32: our contact solver beside MJX's own.
+"""Error and speed of one physics step in float32: our contact solver and MJX's own.
 
     python benchmarks/bench_solver.py [--episodes 48]
 
-Right is what MJX's solver ends at in float64, with iterations to spare. The states are those of
-the scripted expert's episodes.
+The reference is the result of MJX's solver in float64, with iterations to spare. The states are
+those of the scripted expert's episodes.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from starjax.sim import env as envs
 from starjax.sim.quiet_mjx import mjx
 from starjax.sim.scene import Scene
 
-# Of MJX's solver: iterations, line-search turns, tolerance.
+# MJX's solver: iterations, line-search turns, tolerance.
 EXACT = (100, 50, 1e-14)
 SETTINGS = [(60, 40, 1e-9), (8, 8, 1e-7), (8, 6, 1e-7), (8, 4, 1e-7), (4, 8, 1e-7)]
 QUANTILES = (0.5, 0.99, 0.999, 1.0)

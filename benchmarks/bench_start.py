@@ -4,7 +4,7 @@
 
 Each start is a fresh process that trains as `starjax train` does (imports, a dataset from memory,
 normaliser, parameters, compilation, one step) and is stopped before it would save; the cold one
-begins with an empty compilation cache, the warm one with what that left. PyTorch's is its first
+begins with an empty compilation cache, the warm one with its cache. PyTorch's is its first
 compiled step, also since the start of its process.
 """
 

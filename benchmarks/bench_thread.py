@@ -3,7 +3,7 @@
     python benchmarks/bench_thread.py [--batches 360]
 
 Whole control periods of the environment with the arm at rest: control, physics, measurements. The
-scenes take turns, so that other work on the machine slows all of them; a share is the median of
+scenes take turns: other work on the machine slows all of them; a share is the median of
 the turns' own. Programs are compiled side by side.
 """
 

@@ -2,8 +2,8 @@
 
     python benchmarks/bench_train.py [--only "96 px"] [--peer [PYTHON]] [--tiny]
 
-The floor is what the multiplications of one step take at the rate of a large matrix product timed
-in the same process, plus what AdamW and the average must read and write at the rate of a large
+The floor is the time of the multiplications of one step at the rate of a large matrix product timed
+in the same process, plus that of the bytes of AdamW and the average at the rate of a large
 copy: no framework can be faster without doing less. On a GPU the rows are the paper's model at two
 sizes of crop, on a CPU small ones.
 """
@@ -20,7 +20,7 @@ import numpy as np
 
 from starjax import runtime
 
-STATE_PASSES = 9  # of AdamW and the average: gradient, and in and out of p, m, v, average
+STATE_PASSES = 9  # bytes of AdamW and the average: gradient, and in and out of p, m, v, average
 
 CASES = {
     "gpu": {"96 px": _setup.paper(96), "224 px": _setup.paper(224)},

@@ -1,4 +1,4 @@
-"""Control steps a second on a CPU: a program for each core, against one for all of them.
+"""Control steps per second on a CPU: one program per core, against one for all of them.
 
     python benchmarks/bench_workers.py [--image 128] [--tiny]
 
@@ -16,12 +16,12 @@ from starjax.data import schema
 from starjax.rollouts import agent, engine, episodes, workers
 from starjax.sim import env as envs
 
-SEGMENTS = 8  # of a measurement: 4 s simulated, in which no episode ends
+SEGMENTS = 8  # control steps of a measurement: 4 s simulated, in which no episode ends
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--image", type=int, default=128, help="pixels a side")
+    parser.add_argument("--image", type=int, default=128, help="side in pixels")
     parser.add_argument("--tiny", action="store_true", help="a test's sizes, nothing is written")
     asked = parser.parse_args()
     runtime.prepare_xla()
@@ -31,7 +31,7 @@ def main() -> None:
     for name, lanes, max_workers in (
         ("one program", _visited.CPU_LANES, 1),
         ("one program, fewer lanes", workers.CPU_LANES, 1),
-        ("one for each core", workers.CPU_LANES, workers.worker_count()),
+        ("one per core", workers.CPU_LANES, workers.worker_count()),
     ):
         rows[name] = measure(env, lanes, max_workers, segments)
         rows[name]["times_one_program"] = (

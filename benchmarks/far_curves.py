@@ -21,7 +21,7 @@ def main(folder: Path, file: Path) -> None:
 
 
 def is_steady(served: dict[str, Any] | None) -> bool:
-    """Whether there is nothing but a delay."""
+    """True for a delay alone."""
     if served is None:
         return False
     network = served["network"]

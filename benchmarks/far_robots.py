@@ -2,8 +2,8 @@
 
     python benchmarks/far_robots.py OUT [--only "100 ms"] [--trials 2] [--policy compact] [--tiny]
 
-OUT gets a result file for each network, as `starjax evaluate` writes them, with what the clients
-report beside. What the clock is: `_far_robots.py`.
+OUT gets a result file for each network, as of `starjax evaluate`, with the clients' reports.
+`_far_robots.py` has the clock.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from _far_robots import Network
 from starjax import runtime
 from starjax.core import config, config_json
 
-IMAGE_SIZE = 128  # of the policy that ships
+IMAGE_SIZE = 128  # limit of the packaged policy
 GROUP = 12  # trials that are simulated together
 NETWORKS = {
     "no_delay": Network(ahead=0),

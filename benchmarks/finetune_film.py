@@ -15,8 +15,8 @@ from starjax import runtime
 from starjax.report import encode, outcomes, results, scene_view, style, video
 
 PIXELS = 256  # a side of a picture
-PICTURES = 6  # of each trial
-FIRST = 0.2  # of a trial's duration: before, the tools approach
+PICTURES = 6  # moments of each trial
+FIRST = 0.2  # fraction of a trial's duration: before, the tools approach
 
 
 def main() -> None:
@@ -60,7 +60,7 @@ def choose(before: results.Run, after: results.Run, named: list[int] | None) -> 
 
 
 def draw(clips: list[video.Clip]) -> Any:
-    """Draws moments of both trials, a row each, the last one at the end."""
+    """Draws moments of both trials in a row per trial, the last one at the end."""
     camera = scene_view.camera(clips[0].result.scene, PIXELS)
     figure = style.figure(1.5 * PICTURES, 3.3)
     for axes, clip in zip(figure.subplots(len(clips), PICTURES), clips, strict=True):

@@ -53,7 +53,7 @@ def runs(folder: Path = RESULTS) -> str:
 
 
 def branches(folder: Path = RESULTS) -> str:
-    """Returns, for rounds with takeovers, what the expert finished, and the trials it could not."""
+    """Returns the takeovers that the expert finished, and the trials without one, by round."""
     told = [found for found in _results(folder) if "branches" in found["rounds"][-1]]
     told.sort(key=_name)
     names = list(told[0]["rounds"][-1]["branches"]) if told else []

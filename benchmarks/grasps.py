@@ -4,7 +4,7 @@
 
 RUN is a method's folder, of an evaluation that recorded trials (`--eval.video-trials`). Jaws close
 along their y axis, wanted on a wall's normal; the tip is wanted on the wall, `RIM_RADIUS` from the
-block's axis. Coming down is measured where nothing touches yet, from the block as it stood first.
+block's axis. Coming down is measured before any touch, from the block as it stood first.
 """
 
 import argparse

@@ -18,7 +18,7 @@ from starjax.sim import bodies, scene
 from starjax.tasks.needle_pick import task as needle
 
 TAKER = 1  # index of its arm
-CLOSES = 0.6  # of the jaws' largest opening in a trial
+CLOSES = 0.6  # fraction of the jaws' largest opening in a trial
 LIFTED = 2  # stage of a needle that the first tool holds in the air
 
 

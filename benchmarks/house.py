@@ -2,7 +2,7 @@
 
     python benchmarks/house.py [--cases]
 
-Reads the source by `ast` and `tokenize` and imports nothing of it, so that any commit can be
+Reads the source by `ast` and `tokenize` and imports nothing of it: any commit can be
 counted: `python benchmarks/house.py --root CHECKOUT`.
 """
 

@@ -30,7 +30,7 @@ from starjax.addons.formats.mapping import ArmColumns, CameraColumn, Map
 from starjax.runtime import xla
 from starjax.training import log as training_log
 
-SIZE, STEPS, HZ = 128, 300, 30  # pixels a side, control steps of an episode, per second
+SIZE, STEPS, HZ = 128, 300, 30  # side in pixels, control steps of an episode, per second
 SAMPLE_S = 5.0
 _LINE = re.compile(r"(Rss\w+|VmHWM):\s+(\d+) kB")
 

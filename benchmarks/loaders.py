@@ -4,7 +4,7 @@
     python benchmarks/loaders.py DATASET
 
 Each loader runs in a process of its own, twice in turn, from files that no cache holds. grain reads
-by numpy's maps, as its own sources of files do, and by our reader.
+by numpy's maps, like its own sources of files, and by our reader.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from starjax.data import load
 from starjax.data.episode_array import EpisodeArray
 
 BATCH, ROUNDS, SECONDS = 64, 2, 15.0  # frames; runs of each loader; of a run
-THREADS, AHEAD = 16, 4  # of grain, as ours; batches
+THREADS, AHEAD = 16, 4  # threads of grain, as ours; batches
 LOADERS = ("ours", "grain, numpy's maps", "grain, our reader")
 
 

@@ -27,10 +27,10 @@ from starjax.runtime import files
 EARLY, FALSE = 0.9, 0.1  # goals: failures announced before the clock, false alarms
 ALPHAS = (0.01, 0.02, 0.03, 0.05)
 WINDOWS = (1, 2, 3)  # multiples of the recorded window of stillness
-TROCARS = 12  # of every task
+TROCARS = 12  # scores of every task
 FIRST = ("disagreement", "stillness", "clock", "closure")
 FIRST_SCORES, NEW_SCORES = "first scores", "new scores"
-PACKAGED = {"compact": FIRST_SCORES}  # of the others: the new ones
+PACKAGED = {"compact": FIRST_SCORES}  # scores of the others: the new ones
 _HELD = 3  # decisions
 _LEAST = 0.25  # progress per time, of a divisor
 _STILLNESS, _CLOSURE, _PROGRESS = map(scores.NAMES.index, ("stillness", "closure", "progress"))

@@ -45,7 +45,7 @@ class Trials(NamedTuple):
 
 
 def main(policy: str, out: str, still_s: str, batches: str, each: str, *levels: str) -> None:
-    """Runs the trials and writes their columns, and what made them."""
+    """Runs the trials and writes their columns and provenance."""
     session.start_jax(*session.POLICY_MODULES)
     kinds = disturbances.parse_levels("disturbance", levels)
     who = disturbable(policy, kinds)

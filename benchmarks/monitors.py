@@ -35,7 +35,7 @@ COLUMNS = ("success", "lost", "invalid", "steps", "scores")
 TESTED, UNDISTURBED = "nothing, trocars of the test", "nothing, the task's trocars"
 _NEVER = 1e9  # a threshold beyond any score
 STRICT = 0.01  # a second rate of false alarms
-_OPEN = 0.3  # of [-1, 1]: wider than around any object
+_OPEN = 0.3  # opening in [-1, 1]: wider than around any object
 
 
 def silent(policy: str, still_s: str, out: str) -> None:

@@ -2,10 +2,10 @@
 
     python benchmarks/peer_torch.py {train,policy} --crop 96 [--batch 256] [--device cpu --tiny]
 
-Prints one JSON object. The other benchmarks run it by `--peer`, in a process of its own so that its
+Prints one JSON object. The other benchmarks run it by `--peer`, in a process of its own, whose
 memory is free again; nothing else here needs PyTorch. Settings: bf16 by autocast (bf16 weights for
 the policy call), channels-last, torch.compile, fused AdamW, averages by `_foreach_lerp_`, and each
-row with and without one CUDA graph around all of it.
+row with and without one CUDA graph.
 """
 
 import argparse

@@ -29,13 +29,13 @@ MOMENTS = {
     "peg_transfer_bimanual": (170, "side"),
     "needle_handover": (235, "side"),
     "endoscope_track": (120, "camera"),
-    "endoscope_track: what it sees": (120, "endoscope"),
+    "endoscope_track: its image": (120, "endoscope"),
     "needle_regrasp": (120, "camera"),
     "needle_drive": (160, "camera"),
     "needle_drive: its near camera": (160, "camera_near"),
     "suture_throw": (420, "camera"),
 }
-TROCAR = 1  # of the task's twelve
+TROCAR = 1  # index of the task's twelve
 
 
 def main(file: Path, *titles: str) -> None:

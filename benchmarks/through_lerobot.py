@@ -1,9 +1,9 @@
-"""No time: demonstrations that went through LeRobot's format and lost what says the trocar.
+"""No time: demonstrations that went through LeRobot's format and lost the trocar.
 
     python benchmarks/through_lerobot.py DATASET OUT
 
 They are exported, all that only we write and all that says a trocar is removed from the files, and
-what is left is imported by a mapping, with trocars estimated from the motion. OUT gets `lerobot`,
+the rest is imported by a mapping, with trocars estimated from the motion. OUT gets `lerobot`,
 `map.toml` and `imported`, which trains as the dataset itself: this is how far it is from it.
 """
 
@@ -75,7 +75,7 @@ def is_ours(name: str) -> bool:
 
 
 def strip(folder: pathlib.Path) -> None:
-    """Removes from an export what only we write, and what says the trocar."""
+    """Removes our own columns and the trocar from an export."""
     for name in OURS:
         (folder / name).unlink()
     for path in [*folder.rglob("data/*/*.parquet"), *folder.rglob("meta/episodes/*/*.parquet")]:

@@ -22,7 +22,7 @@ RESULTS = HERE.parent / "benchmarks" / "results"
 PANELS = {"seen trocars": "seen", "unseen trocars": "unseen", "200 other trocars": "trocars"}
 OF_EXPERTS = {"seen": "seen", "unseen": "unseen", "trocars": "others"}
 EXPERTS = {
-    "default": ("expert, a plane for each trocar", "-"),
+    "default": ("expert, one plane per trocar", "-"),
     "one_plane": ("expert, one plane for all", ":"),
 }
 SHIFT = 0.5  # degrees between the marks of two lines

@@ -25,7 +25,7 @@ def brought(requirements: list[str]) -> set[str]:
         try:
             needed = importlib.metadata.requires(name) or []
         except importlib.metadata.PackageNotFoundError:
-            continue  # of another platform
+            continue  # files of another platform
         wanted += [
             need
             for need in map(Requirement, needed)

@@ -36,7 +36,7 @@ TINY = config.PolicyConfig(
 
 
 def relative(state: Any, tips: Any) -> jax.Array:
-    """Of each arm: tip to block in the world's frame and in the block's, and tip to target."""
+    """For each arm: tip to block in the world's frame and in the block's, and tip to target."""
     state = jnp.asarray(state)[..., None, :]
     to_block, to_target = state[..., :3] - tips, state[..., 9:12] - tips
     block = rcm.rot6d_decode(state[..., 3:9])
@@ -125,12 +125,12 @@ def told(trocar: rcm.Trocar, arms: int = 1) -> rcm.TrocarFrame:
 def dataset(
     seed: int, demos: int = 8, length: int = 30, image_size: int = 0, arms: int = 1
 ) -> windows.Dataset:
-    """What `drawn` returns but for rounding, in one program."""
+    """`drawn` up to rounding, in one program."""
     return jax.jit(lambda: drawn(seed, demos, length, image_size, arms))()
 
 
 def drawn(seed: int, demos: int, length: int, image_size: int, arms: int) -> windows.Dataset:
-    """Each demonstration goes from A to B at constant height; its roll depends on where it is. Two
+    """Each demonstration goes from A to B at constant height; its roll depends on its place. Two
     share a trocar. Further arms go other ways through trocars of their own. Golden files were
     made of these, to the last bit."""
     paths = [

@@ -2,7 +2,7 @@
 
     python tests/fuzz_server.py [FRAMES] [SEED]
 
-Prints what came of them. It fails if the server ends, or answers a good request otherwise after
+Prints their outcomes. It fails if the server ends, or answers a good request otherwise after
 them than before. A part of the frames, `served.bad_frame` alone, is in the tests.
 """
 
@@ -81,7 +81,7 @@ def talk(address, rng, good, counts):
 
 
 def stranger(address, rng, counts):
-    """Bytes that are no handshake, or half of one."""
+    """Bytes without a handshake, or half of one."""
     host, port = address.removeprefix("ws://").split(":")
     half = b"GET / HTTP/1.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
     with socket.create_connection((host, int(port)), timeout=20) as raw:

@@ -5,7 +5,7 @@ before or after a chosen one of these calls; no state that a kill can leave behi
 Jobs that write from native code can be killed by the clock instead.
 
 A job is a function of one folder in a Python file. One process imports that file and forks a child
-for every start, so that imports are paid for once; jax must not run anything on import.
+for every start: imports are paid for once; jax must not run anything on import.
 """
 
 import importlib.util
@@ -70,7 +70,7 @@ def _main(file: str, job: str, tmp: Path, kills: int, seed: int, mode: str) -> N
     spec.loader.exec_module(module)
     run = getattr(module, job)
     rng = random.Random(seed)
-    _start(run, tmp / "warm", None)  # fills the compilation cache, so that the next is timed right
+    _start(run, tmp / "warm", None)  # fills the compilation cache before the timed run
     shutil.rmtree(tmp / "warm")
     began = time.monotonic()
     calls = _start(run, tmp / "whole", None)

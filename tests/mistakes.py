@@ -10,7 +10,7 @@ from starjax.core import errors
 
 @contextlib.contextmanager
 def of(argument: str, got: object = "") -> Iterator[pytest.ExceptionInfo[errors.UsageError]]:
-    """Expects a mistake of `argument` with `got` among what came, in one line."""
+    """Expects a mistake of `argument` with `got` in its value, in one line."""
     with pytest.raises(errors.UsageError) as caught:
         yield caught
     error = caught.value

@@ -27,7 +27,7 @@ def write(
     """Writes it and returns its description.
 
     Args:
-      size: pixels a side; 0 for a dataset of task states.
+      size: side in pixels; 0 for a dataset of task states.
       demos: successful ones; two share a trocar. One more failed, and is not kept.
       failures: the second one failed, and is kept.
       wrist: the tools are needle drivers, whose shafts move as a straight tool would.

@@ -13,7 +13,7 @@ from starjax.policies import sequences
 
 ACTION = 2
 STEPS = 400
-PRESENT = jnp.array([[0.7, -0.6], [-0.5, 0.8]])  # of two samples, which it sees
+PRESENT = jnp.array([[0.7, -0.6], [-0.5, 0.8]])  # shape of two samples
 
 
 def model(settings: config.PolicyConfig) -> sequences.SequenceModel:
@@ -54,7 +54,7 @@ def learned(settings: config.PolicyConfig) -> tuple[Any, jax.Array]:
 
 
 def sampled(settings: config.PolicyConfig, params: Any, seed: int = 2) -> np.ndarray:
-    """`[2, H, ACTION]` of what it says."""
+    """`[2, H, ACTION]` of its output."""
     keys = jax.random.split(jax.random.key(seed), len(PRESENT))
     sample = jax.jit(model(settings).sample)
     return np.asarray(sample(params, keys, condition(PRESENT), None))

@@ -72,7 +72,7 @@ def running(batches, port=0, key=KEY, clients=8, log=lambda line: None):
 
 
 def bad_frame(rng, good):
-    """A frame that is no request, or hardly one: cut, flipped, random, or another map."""
+    """An invalid frame: cut, flipped, random, or another map."""
     kind = rng.integers(5)
     if kind == 0:
         return good[: rng.integers(len(good))]

@@ -1,4 +1,4 @@
-"""Starts the processes of one run, for tests of what they do together."""
+"""Starts the processes of one run, for tests of their common work."""
 
 import os
 import socket

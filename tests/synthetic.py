@@ -79,7 +79,7 @@ def figures(method, rows):
 
 
 def about(method, seed=0):
-    """What a run says beside its figures."""
+    """Provenance of a run."""
     settings = config.RunConfig(
         method=method, preset="cpu", seed=seed, policy=config.PolicyConfig(observation="state")
     )

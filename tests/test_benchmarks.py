@@ -1,4 +1,4 @@
-"""Benchmarks run, one with what a state carries on a GPU, which a run on a CPU would not see."""
+"""Benchmarks run, one with the carry of a GPU's state, absent on a CPU."""
 
 import json
 import sys

@@ -151,7 +151,7 @@ def test_a_second_stop_while_the_first_is_told_is_no_traceback():
 
 
 def test_ctrl_c_in_a_callback_of_the_collector_is_not_lost():
-    """Python drops what is raised there, and jax has such a callback."""
+    """Python drops exceptions there, and jax has such a callback."""
     code = """
         import gc, os, signal, time
         from starjax import cli
@@ -232,7 +232,7 @@ def test_a_cache_that_takes_no_program_is_one_line_and_work_goes_on():
 
         cli.run(work)
         """,
-        JAX_COMPILATION_CACHE_DIR="/proc/self/task",  # it is there, and takes no file of anybody's
+        JAX_COMPILATION_CACHE_DIR="/proc/self/task",  # it exists, and replaces no file of others
     )
     said, warned = process.communicate(timeout=60)
     assert process.returncode == 0 and said.split() == ["3.0", "8.0", "15.0"]

@@ -1,4 +1,4 @@
-"""The doctor finds what is planted, and gives each fault one remedy."""
+"""The doctor finds planted faults, and gives each one remedy."""
 
 import errno
 import fcntl

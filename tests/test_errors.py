@@ -1,4 +1,4 @@
-"""How a mistake is worded: the argument, what was expected, what came, what to do."""
+"""Parts of a mistake: the argument, the expected and the actual value, a hint."""
 
 import pickle
 

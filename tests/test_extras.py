@@ -1,4 +1,4 @@
-"""What works without any extra, and what a command says whose extra is missing."""
+"""Functions without any extra, and messages of commands whose extra is missing."""
 
 import importlib.metadata
 import json
@@ -16,7 +16,7 @@ from starjax.core import errors, extras
 
 ROOT = pathlib.Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-# A process that has only jax, numpy and what these bring.
+# A process with only jax, numpy and their dependencies.
 BARE = "import sys\nsys.modules |= dict.fromkeys({absent})\n"
 
 

@@ -2,7 +2,7 @@
 
     python tests/test_goldens.py PART...    writes tests/golden/identity/PART.json anew
 
-- `model` (bytes of the compiled MJCF) stands apart from what users' files are found by. Versions
+- `model` (bytes of the compiled MJCF) is separate from the digests of users' files. Versions
   and digests of code are those of core/accepted.json.
 - `steps`, `losses` and `trials` hold to the last bit on the machine that wrote them (`machine`),
   and within `TOLERANCE` on others.
@@ -46,7 +46,7 @@ HERE = pathlib.Path(__file__).parent
 GOLDEN = HERE / "golden" / "identity"
 OLD = HERE / "golden" / "opened" / "run_4bec7307.zip"
 SOURCE = HERE.parent / "src" / "starjax"
-DIGITS = 12  # of a digest
+DIGITS = 12  # characters of a digest
 SHORT = 60  # characters of a value that a golden file shows as it is
 # Values of the machine and its packages.
 VOLATILE = ("versions", "jax_settings", "platform", "lanes", "chunk", "command")
@@ -60,7 +60,7 @@ TOLERANCE = {"tip_m": 1e-4, "losses": 0.05, "successes": 3, "steps": 0.03}
 def datasets() -> dict[str, Any]:
     """Description of a dataset of each task and expert; long values as digests.
 
-    Of states; one more of images.
+    For states; one more for images.
     """
     found = {"model": {}, "described": {}}
     kinds = [(name, "state") for name in registries.tasks.names()] + [("peg_transfer", "image")]
@@ -294,7 +294,7 @@ def test_numbers_are_what_they_were(part, monkeypatch):
 
 
 def write(part: str) -> None:
-    """Writes a golden file, a line for each value of its first two levels."""
+    """Writes a golden file, one line per value of its first two levels."""
     value = plain({**FACTS, **NUMBERS}[part]())
     if part in NUMBERS:
         value = {"machine": machine(), **value}

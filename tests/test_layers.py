@@ -1,4 +1,4 @@
-"""Imports point one way: each layer knows only those to its left (read from the source by ast)."""
+"""Imports point one way: each layer imports those to its left only (read by ast)."""
 
 import ast
 import pathlib

@@ -1,4 +1,4 @@
-"""Table I of the paper as properties: which part of an action changes with the trocar."""
+"""Table I of the paper as properties: the parts of an action that change with the trocar."""
 
 import jax
 import numpy as np
@@ -9,7 +9,7 @@ from starjax import rcm
 P_WORLD_REF = np.array([0.0, 0.0, 0.15], np.float32)
 # Table I, row "trocar-invariant component".
 INVARIANT = {"rcm1": set(), "rcm2": set(), "rcm3": {"R"}, "rcm4": {"p"}}
-# With one yaw for every trocar nothing is left of what tells the first two from the third.
+# With one yaw for every trocar the first two no longer differ from the third.
 INVARIANT |= {"rcm1_fixed_yaw": {"R"}, "rcm2_fixed_yaw": {"R"}}
 TABLE_I = pytest.mark.parametrize(("name", "invariant"), INVARIANT.items(), ids=INVARIANT.keys())
 
@@ -46,7 +46,7 @@ def decode_everywhere(space, action):
 
 
 def spread(values):
-    """Largest difference over the trocars, for the sample where it is smallest and largest."""
+    """Largest difference over the trocars, smallest and largest over the samples."""
     by_sample = np.ptp(values, axis=0).reshape(values.shape[1], -1).max(axis=-1)
     return by_sample.min(), by_sample.max()
 
@@ -65,8 +65,8 @@ def test_invariant_component(name, invariant, actions):
 
 @TABLE_I
 def test_invariant_component_of_the_action(name, invariant, actions):
-    """A tip position (or a rotation) that the task asks for is the same number at every trocar
-    in the space where it is absolute, and another one where it is relative (Theorem 1)."""
+    """A tip position (or a rotation) of the task is the same number at every trocar
+    in the absolute space, and another one in the relative space (Theorem 1)."""
     space = rcm.ACTION_SPACES[name]
     source = decode_everywhere(
         rcm.ACTION_SPACES["rcm4" if "p" in space.slices else "rcm3"],
@@ -106,7 +106,7 @@ def test_relative_differs_from_absolute_by_more_than_a_constant(actions):
 
 @pytest.mark.parametrize("name", INVARIANT)
 def test_any_action_lies_on_the_manifold(name, actions):
-    """Theorem 2 (Eq. 18): whatever the network says, at every trocar."""
+    """Theorem 2 (Eq. 18): for any output of the network, at every trocar."""
     pose = decode_everywhere(rcm.ACTION_SPACES[name], 3.0 * actions[name])
     p_world_trocar = np.asarray(rcm.trocar_position(rcm.TROCARS, P_WORLD_REF), np.float64)[:, None]
     off_axis = np.cross(pose.p - p_world_trocar, pose.R[..., 2].astype(np.float64))

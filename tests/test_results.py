@@ -1,4 +1,4 @@
-"""What is printed of results is what the results say, and nothing in experiments/ is left over."""
+"""Printed results equal the files, and every file of experiments/ is used."""
 
 import json
 import re

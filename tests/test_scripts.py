@@ -1,4 +1,4 @@
-"""Scripts beside the package name modules and objects that exist."""
+"""Scripts outside the package name modules and objects that exist."""
 
 import ast
 import importlib

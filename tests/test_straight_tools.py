@@ -15,7 +15,7 @@ from starjax.evaluation import result
 
 DATASETS = {"image": "ce9da5cb7c9386f8", "state": "20a5a359cfddb9f7"}
 FIGURES = "1a55392061edf067"
-DIGITS = 12  # of a figure that do not depend on numpy's version
+DIGITS = 12  # digits of a figure that do not depend on numpy's version
 
 
 def digest(arrays):

@@ -1,4 +1,4 @@
-"""A learner from outside the package: the sequence is a linear map of what is known."""
+"""A learner from outside the package: the sequence is a linear map of the condition."""
 
 import dataclasses
 from typing import Annotated
@@ -12,7 +12,7 @@ from starjax.core.limits import Range
 class ToyConfig:
     """Options of the learner `toy`."""
 
-    gain: Annotated[float, Range(0.0, 10.0)] = 1.0  # of the map
+    gain: Annotated[float, Range(0.0, 10.0)] = 1.0  # weights of the map
     time_dim: int = 8  # not used; other learners have it too
 
 

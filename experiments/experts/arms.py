@@ -1,4 +1,4 @@
-"""Success of scripted experts by arm and tool with a wrist, in C MuJoCo.
+"""Success of scripted experts per arm, with wristed tools, in C MuJoCo.
 
     python experiments/experts/arms.py [--only ur5e/needle_driver/needle_drive ...] \\
         [--per-trocar 2] [--sampled 16] [--seed 2026]

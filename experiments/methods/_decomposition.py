@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-POINTS = 20  # of progress at which a phase is looked at
-LEAST = 0.5  # of a phase, or s of one without an end, that a trial must have come through
+POINTS = 20  # fractions of progress at which a phase is looked at
+LEAST = 0.5  # fraction of a phase, or s of one without an end, that a trial must have come through
 STILL = 1e-5  # m of root mean square below which a position stands still: rounding
-RESAMPLES = 1000  # of the scenes, for the interval
+RESAMPLES = 1000  # draws of the scenes, for the interval
 
 
 class Segment(NamedTuple):
@@ -52,7 +52,7 @@ def first_attempt(
 
 def crossed(trials: Sequence[Sequence[list[Segment]]]) -> dict[int, list[np.ndarray]]:
     """Phase -> for each of its visits `[S', C, G, A, 3]`, of the scenes whose trials all came
-    through it; phases and visits that fewer than half of the scenes came through are left out.
+    through it; phases and visits that fewer than half of the scenes came through are omitted.
 
     Args:
       trials: segments `[S][C]`.
@@ -94,7 +94,7 @@ class Parts(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Of the whole variance, what the trocar explains; 0 of what stands still."""
+        """Share of the variance that the trocar explains; 0 for a constant."""
         whole = self.trocar + self.scene
         return self.trocar / whole if whole > STILL**2 else 0.0
 
@@ -103,7 +103,7 @@ def parts(p: np.ndarray) -> Parts:
     """The variances of wanted positions `[S, C, G, 3]`.
 
     The trocars are all there are: their variance has the divisor C. Scenes are a sample: theirs has
-    S - 1, and what a trocar's mean over scenes owes to chance is taken off `common`.
+    S - 1, and the chance part of a trocar's mean over scenes is subtracted from `common`.
     """
     scenes = len(p)
     of_scene = p.mean(1, keepdims=True)

@@ -4,7 +4,7 @@
 
 The proposition says that the wanted position does not depend on the trocar. So each of some scenes
 is played at every trocar of the task, with the same objects, the same choices of the expert and the
-same disturbance: what then differs between the trocars of a scene is the trocar's doing. Positions
+same disturbance: differences between the trocars of a scene are caused by the trocar. Positions
 are the undisturbed ones that demonstrations record. They are compared at the same progress within
 the same phase of the expert's first attempt: progress is the share of the phase's own duration, as
 paths through other trocars may take longer, and s in a phase without an end.
@@ -14,16 +14,16 @@ With y the position at scene s, trocar c and progress g, of one arm and phase,
     trocar = mean over s, c, g of |y - mean_c y|^2      scene = mean over g of var_s (mean_c y)
     share  = trocar / (trocar + scene)
 
-and beside the share, which a phase with nearly one place for all scenes makes large, the root of
+and with the share, which a phase with nearly one place for all scenes makes large, the root of
 `trocar` in mm: how far a trocar moves the wanted tip. `common` is the part of it that is the same
 in all scenes. A task's own figures average the variances over its phases, weighted by their time.
-Of two arms each is looked at alone, and their trocars change together. Intervals draw scenes anew.
+Two arms are evaluated one by one; their trocars change together. Intervals draw scenes anew.
 
 With a wrist two more points of each tool are compared: its yaw axis, which shows the direction of
 the jaws, and its pitch axis, the end of the shaft.
 
-What is given is the start of a scene. A policy that sees how an object lies in its jaws by now
-knows more, so the share bounds from above what is lost by not telling it the trocar.
+A scene is its start. A policy also observes an object in its jaws, so the share bounds from above
+the loss of a policy without the trocar as an input.
 """
 
 import argparse
@@ -139,7 +139,7 @@ def play(
 
 
 def _episode(environment: envs.Env, agent: Agent, steps: int) -> Callable[..., Any]:
-    """(key, trocar) -> whether it ran `[T]`, success, and what `first_attempt` reads."""
+    """(key, trocar) -> True while it ran `[T]`, success, and the inputs of `first_attempt`."""
 
     def run(key: jax.Array, trocar: rcm.Trocar) -> tuple[jax.Array, ...]:
         key_reset, key_expert = jax.random.split(key)

@@ -12,7 +12,7 @@ from typing import Any
 from starjax.report import style
 
 COLUMNS = 3
-LEAST = 0.005  # of the shares that are written
+LEAST = 0.005  # digits of the shares that are written
 OF_TWO = {"arm0": "gives", "arm1": "takes over"}
 
 

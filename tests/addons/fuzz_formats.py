@@ -1,8 +1,8 @@
 """Damages exports at random and reads them: each ends in arrays or in one line, never otherwise.
 
-`python tests/addons/fuzz_formats.py FORMAT COUNT [SEED]` uses processes of its own, so that
+`python tests/addons/fuzz_formats.py FORMAT COUNT [SEED]` uses processes of its own:
 a crash of a library is counted too. A damage that takes longer than `LIMIT_S` ends its process,
-too, and what it was doing goes to stderr. The damaged files of such an end are kept.
+too, and its stack goes to stderr. The damaged files of such an end are kept.
 """
 
 import collections
@@ -25,7 +25,7 @@ from starjax.core import errors
 from starjax.runtime import files
 
 BATCH = 4000  # damages a process
-LIMIT_S = 60.0  # of one damage, which takes milliseconds
+LIMIT_S = 60.0  # time of one damage, which takes milliseconds
 JSON_VALUES = (
     None,
     -1,
@@ -57,7 +57,7 @@ def prepared(folder: Path, name: str, whole: bool = False) -> Path:
 
 
 def parts(path: Path) -> list[Path]:
-    """Its files, but for text that nobody reads."""
+    """Its files, without unread text."""
     found = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
     return [p for p in found if p.suffix != ".md"]
 
@@ -111,10 +111,10 @@ def _edited(data: bytes, random: random.Random) -> bytes:
 
 
 def attempt(path: Path, name: str, root: Path | None = None) -> str:
-    """What becomes of it: `read`, `refused`, or the exception that nobody expects.
+    """Its outcome: `read`, `refused`, or an unexpected exception.
 
     Args:
-      root: where an export is brought back to, too.
+      root: folder of the files and of a restored export.
     """
     try:
         with base.open_dataset(path, name) as source:
@@ -137,7 +137,7 @@ def run(
     """As many accidents, each to one file of a sound export, which is sound again afterwards.
 
     Args:
-      hung: where the stack goes, before the process ends, of a read that takes too long.
+      hung: file for the stack of a read that takes too long, before the process ends.
     """
     found, draws = collections.Counter(), random.Random(seed)
     among = parts(path)

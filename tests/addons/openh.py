@@ -198,7 +198,7 @@ def source(name, episodes=4, **given):
 
 
 def write(root, name, **given):
-    """Writes it as LeRobot v2.1, with splits and columns that nobody maps; returns the path."""
+    """Writes it as LeRobot v2.1, with splits and unmapped columns; returns the path."""
     made = source(name, **given)
     base.FORMATS.get("lerobot-v2.1").write(root, made, False)
     path = root / "meta/info.json"

@@ -1,4 +1,4 @@
-"""`starjax bench`: what it times, and where it writes."""
+"""`starjax bench`: its rows and its file."""
 
 import dataclasses
 import json
@@ -17,7 +17,7 @@ SMOKE = presets.PRESETS["smoke"]
 
 @pytest.fixture
 def scored(tmp_path):
-    """A method's folder as far as bench asks for it."""
+    """The part of a method's folder that bench reads."""
     folder = tmp_path / "stardiff"
     folder.mkdir()
     folders.claim(folder, SMOKE, "demos-a")

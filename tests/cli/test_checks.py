@@ -52,7 +52,7 @@ def test_presets_pass_their_own_checks(name):
 
 @pytest.fixture
 def places(tmp_path, monkeypatch):
-    """A folder with a file, one that may not be written, and what report and evaluate read."""
+    """A folder with a file, one without permission to write, and inputs of report and evaluate."""
     (tmp_path / "file").touch()
     (tmp_path / "link").symlink_to("nowhere")
     (tmp_path / "closed").mkdir()

@@ -1,4 +1,4 @@
-"""Demonstrations of a run: which are asked for."""
+"""Demonstrations of a run: the requested ones."""
 
 import dataclasses
 
@@ -107,7 +107,7 @@ def test_demonstrations_are_recorded_with_what_is_wrong(tmp_path, monkeypatch):
         collect()
         roots.append(root)
     assert len(set(roots)) == 3
-    # Images are drawn in training: what changes the motion leaves them a function of the state.
+    # Images are drawn in training, from the state, also if the motion is disturbed.
     recorded = [schema.describe(asked[1], *asked[3:]) for asked in given]
     assert not any("image_camera" in about["features"] for about in recorded)
     assert "randomise" not in schema.describe(env, *given[0][3:])

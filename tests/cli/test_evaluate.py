@@ -197,7 +197,7 @@ def test_the_seed_is_that_of_the_flag(file):
     assert plan["seed"] == 5 and plan["max_steps"] == 30
     result = json.loads((file.parent / "here" / "result.json").read_text())
     assert {trial["seed"] for trial in result["trials"]} == {5} == {result["seed"]}
-    assert result["config"]["seed"] is None  # of the training, which no file of weights says
+    assert result["config"]["seed"] is None  # seed of the training, which no file of weights says
 
 
 @pytest.mark.parametrize(("name", "label"), [("dp_ee", "DP-EE"), ("dp_ee_proj", "DP-EE-Proj")])
@@ -217,7 +217,7 @@ def test_a_method_of_a_run_of_several_is_scored_under_its_own_name(
     result = json.loads((run / name / "evaluate-seed7-1x1s" / "result.json").read_text())
     assert (result["method"], result["config"]["method"]) == (name, name)
     assert (result["seed"], result["config"]["seed"]) == (7, 3)
-    # what its weights were trained with, whatever the settings beside them say
+    # settings of its training, not those next to the weights
     assert (result["config"]["train"]["steps"], result["seen"]["trials"]) == (77, 4)
 
 
@@ -235,7 +235,7 @@ def test_trials_are_run_as_the_policy_and_the_flags_say(tmp_path, monkeypatch):
     _, _, planner, _, _, settings = said["args"]
     assert settings._asdict() == {**flags, "seed": 9}
     assert planner.about == {"obs_horizon": 3, "execute": 4}
-    assert said["identity"]["policy"]["crop_fraction"] == 0.5  # of what the encoder sees
+    assert said["identity"]["policy"]["crop_fraction"] == 0.5  # side of the encoder's image
 
 
 def test_a_machine_without_a_video_encoder_still_gets_the_result(file, monkeypatch, capsys):
@@ -248,7 +248,7 @@ def test_a_machine_without_a_video_encoder_still_gets_the_result(file, monkeypat
 
 
 def test_a_policy_called_policy_is_known_by_its_folder(tmp_path):
-    """And by what is in it: most runs' folders have the names of their methods."""
+    """And by its content: most runs' folders have the names of their methods."""
     names = []
     for content in (b"a", b"b", b"a"):
         path = tmp_path / "stardiff" / "policy.safetensors"
@@ -348,7 +348,7 @@ def test_the_times_of_an_evaluation_are_medians_in_seconds():
 def test_distances_of_a_sweep_are_to_the_trocars_of_the_weights(file):
     run = file.parent / "dp_rcm2"
     run.mkdir()
-    folders.claim(run, presets.PRESETS["smoke"], "demos-a")  # of 8 trocars; the weights saw 4
+    folders.claim(run, presets.PRESETS["smoke"], "demos-a")  # 8 trocars; the weights saw 4
     file.rename(run / "policy.safetensors")
     assert sweep.main([str(run), "--trocars", "9", "--eval.time-limit-s", "1"]) == 0
     trials = json.loads((run / "sweep.json").read_text())["trials"]

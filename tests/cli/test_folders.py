@@ -59,7 +59,7 @@ def test_every_setting_but_three_decides_the_weights(tmp_path, part):
     for name in config_json.as_json(settings).keys() - free:
         if hasattr(settings, name):
             now = dataclasses.replace(settings, **{name: another(getattr(settings, name))})
-        else:  # of the learner's
+        else:  # options of the learner's
             now = config.with_options(settings, **{name: another(getattr(settings.options, name))})
         other = dataclasses.replace(SMOKE, **{part: now})
         with mistakes.of(f"{part}.{name}"):
@@ -160,7 +160,7 @@ def test_an_evaluation_is_under_way_until_its_result_is_there(tmp_path):
     (tmp_path / "result.json").touch()
     os.utime(trials / "plan.json", ns=(1, 1))
     assert not folders.is_under_way(tmp_path)
-    (trials / "plan.json").touch()  # of a larger one
+    (trials / "plan.json").touch()  # trials of a larger one
     os.utime(tmp_path / "result.json", ns=(1, 1))
     assert folders.is_under_way(tmp_path)
 

@@ -1,4 +1,4 @@
-"""What a run tells its user: plan, warnings, outcome. Facts and numbers, not sentences."""
+"""Messages of a run: plan, warnings, outcome. Facts and numbers, not sentences."""
 
 import dataclasses
 import types

@@ -1,4 +1,4 @@
-"""Command lines: what is typed becomes settings, or a mistake of the flag that it belongs to."""
+"""Command lines become settings, or a mistake that names its flag."""
 
 import contextlib
 import dataclasses
@@ -184,7 +184,7 @@ def helped(command, capsys, kind="--help-all"):
     usage, *lines = capsys.readouterr().out.replace("│", " ").splitlines()
     found, entry = {}, []
     for line in lines:
-        # Another name of a flag stands before it, with what it takes.
+        # Another name of a flag stands before it, with its values.
         if flag := re.match(r"  (?:--\w+ \[.*\]\]?, )?(--?\w[^ ,]*)", line):
             entry = found[flag[1]] = re.split(r"\s{2,}", line.strip(), maxsplit=1)[1:]
         elif line.startswith(" " * 6):

@@ -1,4 +1,4 @@
-"""`starjax pack`: what its file holds, what it says, and mistakes in one line."""
+"""`starjax pack`: its file, its output, and mistakes in one line."""
 
 import dataclasses
 

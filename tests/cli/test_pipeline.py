@@ -1,4 +1,4 @@
-"""The order of a run's stages, what is skipped, and how it stops. The stages are stubs."""
+"""The order of a run's stages, skipped ones, and stops. The stages are stubs."""
 
 import dataclasses
 import json
@@ -176,7 +176,7 @@ def test_a_result_of_other_trials_is_not_taken_for_done(tmp_path):
     older = json.loads(json.dumps(result))
     del older["config"]["policy"]["freeze_encoder"]
     assert is_done(older)
-    assert not is_done({**result, "seed": 1})  # of `starjax evaluate --out`
+    assert not is_done({**result, "seed": 1})  # folder of `starjax evaluate --out`
     more = dataclasses.replace(smoke, eval=dataclasses.replace(smoke.eval, trials=9))
     assert not is_done(result, more)
     other = dataclasses.replace(smoke, scene=config.SceneConfig(task="reach"))

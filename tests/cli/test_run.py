@@ -1,4 +1,4 @@
-"""The whole command at its smallest, as a user types it, and what it leaves behind.
+"""The whole command at its smallest, as a user types it, and its files.
 
 Task and arm are of other packages, `tests/extension/site` and the page on arms: from the expert to
 the report.

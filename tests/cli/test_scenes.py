@@ -1,4 +1,4 @@
-"""The scene of a run, by name: what is left out is the task's, what is wrong names its flag."""
+"""The scene of a run, by name: the task's defaults, and mistakes that name their flag."""
 
 import contextlib
 

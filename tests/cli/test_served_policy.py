@@ -138,7 +138,7 @@ def test_the_monitor_of_a_server_scores_its_trials(tmp_path, monkeypatch):
     found = result(tmp_path / "here")
     for name, is_success in (("announced", False), ("false_alarms", True)):
         steps = [row["steps"] for row in found["trials"] if row["success"] == is_success]
-        raised = sum(count > 16 for count in steps)  # of 30 Hz; decisions are after every 4th
+        raised = sum(count > 16 for count in steps)  # steps at 30 Hz; decisions are after every 4th
         assert (raised, len(steps)) == tuple(found["alarms"][name].values())[:2]
     assert found["alarms"]["false_alarms"]["successes"]
     stressed = json.loads((tmp_path / "wrong" / "stress.json").read_text())

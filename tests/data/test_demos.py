@@ -1,4 +1,4 @@
-"""Demonstrations: what is collected, that it survives kills and shows damage, and loading."""
+"""Demonstrations: collection, kills, damage, and loading."""
 
 # pyright: reportIndexIssue=false, reportOptionalSubscript=false, reportArgumentType=false
 # pyright: reportGeneralTypeIssues=false, reportOptionalMemberAccess=false
@@ -378,7 +378,7 @@ def test_images_may_stay_on_disk_and_are_found_there(images):
     frames, drawn = load.frames(images)[stubs.CAMERA], whole.dataset.observation.images
     some = np.array([0, 7, frames.shape[0] - 1])
     np.testing.assert_array_equal(frames[some], np.asarray(drawn[stubs.CAMERA])[some])
-    for frame in range(frames.shape[0]):  # in turn, so that what was read does not pile up
+    for frame in range(frames.shape[0]):  # in turn, to bound the memory
         frames[frame]
         assert not _mapped(images)
 
@@ -438,7 +438,7 @@ def test_nothing_is_unpickled(images, tmp_path):
 
 
 def test_an_episode_starts_and_steps_as_its_seed_says(sealed):
-    """Of the seed rule in dataset.json: never the states of an evaluation with this seed."""
+    """Follows the seed rule in dataset.json: never the states of an evaluation with this seed."""
     root, _ = sealed
     env = stubs.make_env("state", unlucky=0.4)
     stream = jax.random.fold_in(jax.random.key(0), schema.STREAM)
@@ -477,7 +477,7 @@ def test_the_label_of_a_disturbed_command_is_what_is_recorded(tmp_path):
 
 
 def test_every_field_is_loaded_as_itself(tmp_path):
-    """Of two arms and two cameras."""
+    """With two arms and two cameras."""
     env = stubs.make_env("image", arms=2, cameras=("left", "right"))
     settings = SETTINGS._replace(per_trocar=1)
     description = schema.describe(env, stubs.trocars(0, 8, arms=2), settings)

@@ -1,4 +1,4 @@
-"""Frames on disk: those of any order, as if they were in memory."""
+"""Frames on disk: any order of them equals frames in memory."""
 
 import os
 

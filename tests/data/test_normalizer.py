@@ -1,4 +1,4 @@
-"""What samples may say: how far each action space reaches, fitted to demonstrations."""
+"""Bounds of samples: the range of each action space, fitted to demonstrations."""
 
 import fakes
 import jax
@@ -39,7 +39,7 @@ def test_a_demonstrated_tip_is_within_reach_through_every_port(dataset, name):
     for part in (space.slices[kind] for kind in ("p", "depth") if kind in space.slices):
         beyond = np.maximum(low[part] - actions[:, part], actions[:, part] - high[part])
         assert (beyond.max(axis=0) <= 1e-3).all(), beyond.max(axis=0)
-        # and no farther than the farthest port asks for
+        # and no farther than the farthest port requires
         assert (high[part] - low[part] < 1.2 * np.ptp(actions[:, part], axis=0)).all()
 
 

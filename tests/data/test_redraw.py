@@ -1,4 +1,4 @@
-"""Images drawn from what a dataset recorded: the recorded ones, to the byte."""
+"""Images drawn from a dataset's states: the recorded ones, to the byte."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Windows: which frames they hold, on the device and on the host."""
+"""Windows: their frames, on the device and on the host."""
 
 import fakes
 import jax

@@ -1,4 +1,4 @@
-"""Where a plan may begin: refused where it is far from the tool, led to from a shallow one."""
+"""The start of a plan: refused far from the tool, approached from a shallow one."""
 
 import dataclasses
 
@@ -111,7 +111,7 @@ def test_a_bound_is_more_than_nothing(bound):
 def test_from_a_tip_just_within_the_trocar_commands_lead_there_gradually(
     compact, unled, depth, limits
 ):
-    """A robot that is where it was last sent, until the plans are the policy's own."""
+    """A robot at its last command, until the plans are the policy's own."""
     policy = dataclasses.replace(compact, **limits)
     axis = np.array([0.1, -0.05, -1.0]) / np.linalg.norm([0.1, -0.05, -1.0])
     pose, trocar = tool(compact, P_WORLD_TROCAR + max(depth, rcm.MIN_DEPTH) * axis, 0.8)

@@ -1,4 +1,4 @@
-"""A robot's loop whatever the network does: which command is next, and none is a jump."""
+"""A robot's loop over a bad network: the next command, without a jump."""
 
 import collections
 import contextlib
@@ -33,7 +33,7 @@ def poses(roll, depth):
 
 
 def plan(number):
-    """Command t of plan `number` turns the tool by 0.1 number + 0.001 t, so that it is known."""
+    """Command t of plan `number` turns the tool by 0.1 number + 0.001 t, its mark."""
     roll = 0.1 * number + 1e-3 * np.arange(HORIZON)
     return Command(poses(roll, np.full(HORIZON, 0.1)), np.zeros(HORIZON, np.float32))
 
@@ -85,7 +85,7 @@ def test_it_asks_ahead_so_that_no_command_is_missed(latency):
     while len(wanted) < 100 - latency:
         number = len(wanted) // EXECUTE + 1
         wanted += [(number, t) for t in range(first, first + EXECUTE)]
-        first = min(latency + 1, EXECUTE - 1)  # asked for as soon as the one before began
+        first = min(latency + 1, EXECUTE - 1)  # requested when the previous one began
     assert given[latency:] == wanted[: 100 - latency]
 
 
@@ -197,7 +197,7 @@ def batches(tmp_path_factory):
 
 
 class Robot:
-    """It is where it was last sent."""
+    """It reaches each command at once."""
 
     def __init__(self):
         self.seen, self.commands = served.moment(), collections.deque()
@@ -216,7 +216,7 @@ def client_of(where, **options):
 
 
 class AtOnce(Connection):
-    """Waits for every answer, as if it came within no time."""
+    """Waits for every answer: latency zero."""
 
     def poll(self):
         reply = super().poll()
@@ -324,7 +324,7 @@ def test_a_server_that_goes_and_comes_back_is_found_again(batches):
         client = client_of(where)
         assert driven_until(lambda: client.report.plans > 0, client, robot)
     plans = client.report.plans
-    client.run(robot, 1.0)  # nobody is there: it holds
+    client.run(robot, 1.0)  # no server: it holds
     assert client.report.plans <= plans + 1 and client.report.held > 5
     with served.running(batches, port=where[1]):
         assert driven_until(lambda: client.report.plans > plans + 1, client, robot)
@@ -389,7 +389,7 @@ def test_numbers_of_a_server_are_checked(batches, lie):
 
 
 def test_answers_that_are_none_are_refused_and_it_holds(batches):
-    """Of a server that sends anything but a plan of this policy."""
+    """For a server that sends no plan of this policy."""
 
     class Liar(Connection):
         lies = iter([{}, {"R": 1}, None, "text", wire.unpack(wire.pack({"p": np.zeros(3)}))])
@@ -457,7 +457,7 @@ def test_an_arm_that_comes_back_elsewhere_waits_for_a_person(batches):
         sent = len(robot.commands)
         robot.seen = robot.seen.replace(pose=elsewhere(robot.seen.pose))
         assert np.linalg.norm(robot.seen.pose.p - robot.commands[-1].pose.p) > 0.01
-        client.run(robot, 1.0)  # its program is there again: nothing is sent
+        client.run(robot, 1.0)  # its program is back: nothing is sent
         assert len(robot.commands) == sent and client.report.silent == 30
         assert client.report.fault.startswith("following") and client.report.plans >= 1
         client.restart(robot.measure())

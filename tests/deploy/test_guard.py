@@ -58,7 +58,7 @@ def names(snapshot, sent=SENT, **bounds):
 
 def test_a_sound_robot_has_none():
     assert names(SOUND) == []
-    assert names(guard.Snapshot(TIP)) == []  # what is not measured is not doubted
+    assert names(guard.Snapshot(TIP)) == []  # no doubt without a measurement
 
 
 @pytest.mark.parametrize("name", ROWS)
@@ -71,7 +71,7 @@ def test_a_doubt_begins_at_its_bound(name):
 @pytest.mark.parametrize("pair", list(itertools.combinations(ROWS, 2)))
 def test_no_doubt_hides_another(pair):
     changed = {key: value for name in pair for key, value in ROWS[name][1].items()}
-    if len(changed) == sum(len(ROWS[name][1]) for name in pair):  # of different fields
+    if len(changed) == sum(len(ROWS[name][1]) for name in pair):  # doubts of different fields
         assert sorted(names(SOUND._replace(**changed))) == sorted(pair)
 
 

@@ -1,4 +1,4 @@
-"""A robot driven by a policy of the same process, and what stops it."""
+"""A robot driven by a policy of the same process, and its stops."""
 
 import jax
 import numpy as np

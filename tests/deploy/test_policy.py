@@ -47,7 +47,7 @@ def registered():
 
 
 def mostly(kind, other):
-    """One kind of observation, and the other where nobody waits."""
+    """One kind of observation; the other in slow tests."""
     kinds = [kind, pytest.param(other, marks=pytest.mark.slow)]
     return pytest.mark.parametrize("made", kinds, indirect=True)
 
@@ -130,7 +130,7 @@ def test_it_decides_alike_whatever_a_program_makes_jax_refuse(made):
     arguments = jax.random.key(7), observed(trained.policy, ()), PORT
     wanted = load(path)(*arguments)
     placed = jax.device_put(arguments)
-    # These know no `vmap`, under which a decision draws its noise.
+    # These have no rule for `vmap`, under which a decision draws its noise.
     strange = {name for name in strict.STRICT if "error_checking" in name}
     with strict.mode({k: v for k, v in strict.STRICT.items() if k not in strange}):
         deployed = load(path)
@@ -383,7 +383,7 @@ def test_a_trocar_beside_the_shaft_is_refused_by_the_owners_bound(made):
 
 @pytest.mark.parametrize("rolls", [(1.4, 1.7), (1.7, 1.4)])
 def test_the_newest_moment_says_which_way_a_tool_is_turned(made, rolls):
-    """An untrained policy commands a roll of about zero, as it reads the tool."""
+    """An untrained policy commands a roll near the tool's, about zero."""
     path, trained, _ = made
     good = observed(trained.policy, ())
     R = rcm.rotation_from_axis_roll(good.pose.R[..., 2], np.float32(rolls))

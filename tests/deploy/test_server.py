@@ -103,7 +103,7 @@ def test_clients_that_share_a_call_get_their_own_plans_and_mistakes(batches):
     for got, wanted in zip(together, alone):
         np.testing.assert_allclose(got["actions"], wanted["actions"], atol=1e-4)
     assert np.abs(alone[0]["p"] - alone[1]["p"]).max() > 1e-3
-    # Of 1, 2 and 3 robots, all of them compiled before.
+    # With 1, 2 and 3 robots, all of them compiled before.
     assert batches.sizes == [1, 2, 3] and programs == batches.policy._infer._function._cache_size()
 
 

@@ -1,4 +1,4 @@
-"""Programs of the documentation run, its commands parse, its links and files are there."""
+"""Programs of the documentation run, its commands parse, its links and files exist."""
 
 import contextlib
 import importlib.util
@@ -70,7 +70,7 @@ def marked(page):
 
 
 def test_programs_run(page, tmp_path, monkeypatch):
-    """The blocks of a page are one program, so each goes on where the one before ended."""
+    """The blocks of a page are one program, so each continues the one before."""
     monkeypatch.chdir(tmp_path)
     names = {"__name__": page.stem}
     text = page.read_text()

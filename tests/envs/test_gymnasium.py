@@ -16,7 +16,7 @@ from starjax.core import errors
 from starjax.envs import registration, settings, trocar_draws, vector
 from starjax.sim import registries
 
-STEPS = 3  # of an episode, so that some end
+STEPS = 3  # time limit at which some episodes end
 REACH = {"max_episode_steps": STEPS, "trocar": "all"}
 MODES = list(gymnasium.vector.AutoresetMode)
 

@@ -34,7 +34,7 @@ def frame(task):
     "space", [name for name, s in rcm.ACTION_SPACES.items() if s.for_wrist is None]
 )
 def test_the_workspace_lies_within_the_bounds_of_actions(task, space):
-    """Poses whose tip and roll are the workspace's, seen through a trocar that nobody tried."""
+    """Poses whose tip and roll are the workspace's, through a new trocar."""
     task = registries.tasks.get(task)
     low, high = ranges.actions(task, rcm.ACTION_SPACES[space])
     assert low.shape == high.shape == (task.arms, rcm.ACTION_SPACES[space].dim)

@@ -239,7 +239,7 @@ def test_what_is_seen_is_so_many_steps_old(env, steps):
 
 
 def test_late_commands_of_a_wrist_are_late_with_its_angles(env):
-    """Straight ones too, whose command has none."""
+    """Straight ones too, whose command has no angles."""
     state = env.reset(KEY, EnvParams(stubs.trocars(0), levels=None))
     state = state.replace(wrist=jnp.full((1, 2), 0.1))
     executed = []

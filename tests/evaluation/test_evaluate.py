@@ -153,7 +153,7 @@ def test_finished_chunks_are_not_run_again(tmp_path, whole, monkeypatch):
     first = run(tmp_path, chunk=3)
     monkeypatch.setattr(engine, "make", lambda *_: None)
     assert_same(run(tmp_path, chunk=3), first)
-    assert_same(run(tmp_path), first)  # what the folder has
+    assert_same(run(tmp_path), first)  # content of the folder
 
 
 def test_other_weights_start_afresh(tmp_path, whole):

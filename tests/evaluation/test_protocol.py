@@ -18,7 +18,7 @@ ROOT = pathlib.Path(__file__).parents[2]
 SOURCE = ROOT / "src" / "starjax"
 GOLDEN = ROOT / "tests" / "golden" / "benchmark.json"
 
-# A change of their code may change what a policy's commands do.
+# A change of their code may change the effect of commands.
 PHYSICS = (
     *("sim/arm_motion.py", "sim/chain.py", "sim/control.py", "sim/dynamics.py", "sim/ik.py"),
     *("sim/linear.py", "sim/mjcf_parts.py", "sim/mounts.py", "sim/physics.py", "sim/robot.py"),

@@ -25,7 +25,7 @@ def test_samples_stay_in_their_ranges_and_repeat():
     assert (drawn.radius <= 0.05).all() and (np.abs(np.rad2deg(drawn.polar) - 90) <= 20).all()
     np.testing.assert_array_equal(drawn.radius, sweep.sample(3, 500, task).radius)
     assert drawn.radius.shape == (500, 1) and sweep.sample(3, 5, two).radius.shape == (5, 2)
-    np.testing.assert_array_equal(  # as ever since 0.1
+    np.testing.assert_array_equal(  # unchanged since 0.1
         drawn.azimuth, rcm.sample_trocar(jax.random.key(3), (500, 1)).azimuth
     )
     with pytest.raises(ValueError, match="count"):

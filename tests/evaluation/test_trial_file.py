@@ -1,4 +1,4 @@
-"""Trials beside a result are those that were in it."""
+"""Trials in a file next to a result equal those in it."""
 
 import json
 

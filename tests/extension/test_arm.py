@@ -12,7 +12,7 @@ import pytest
 from starjax.core import errors
 from starjax.sim import ik, mounts, registries, robot, scene
 
-EULER = 'euler="3.141592654 0 0"'  # of the flange
+EULER = 'euler="3.141592654 0 0"'  # pose of the flange
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Several arms and several cameras: what is one arm's or one camera's is the same beside others."""
+"""Several arms and several cameras: each one's part is independent of the others."""
 
 import dataclasses
 

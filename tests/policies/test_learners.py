@@ -106,7 +106,7 @@ def settings(*argv):
 
 def test_its_options_are_flags_and_stand_in_the_settings_of_a_run():
     found = settings("--preset", "smoke", "--policy.learner", "toy", "--policy.gain", "3")
-    # what both learners have begins as the preset says
+    # common options begin at the preset's values
     assert found.policy.options == toy_learner.ToyConfig(gain=3.0, time_dim=32)
     values = config_json.as_json(found)
     assert values["policy"]["gain"] == 3.0 and values["policy"]["learner"] == "toy"

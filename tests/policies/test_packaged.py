@@ -106,7 +106,7 @@ def test_faults_of_a_packaged_policy_are_found(folder):
 
 
 def test_an_encoder_alone_stands_for_that_of_its_policy():
-    """Names of features and runs hold its fingerprint, so presets find what they did before."""
+    """Names of features and runs hold its fingerprint, so presets find their earlier files."""
     alone = packaged.find_encoder("", "compact")
     prints = [
         policy_file.fingerprint(policy_file.load(path).params["vision"])[:16]

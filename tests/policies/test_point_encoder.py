@@ -37,7 +37,7 @@ def test_points_are_rays_times_the_depth(depth, views):
     z = depth[:, cut, cut][:, 1::2, 1::2]
     side = (np.arange(1, CROP, 2) + 0.5) / (CROP / 2) - 1
     expected = np.stack([side[:, None] * z, side * z, z - 0.35], axis=-1) / 0.1
-    np.testing.assert_allclose(points, expected.reshape(3, -1, 3), atol=2e-3)  # of 10 cm
+    np.testing.assert_allclose(points, expected.reshape(3, -1, 3), atol=2e-3)  # depth of 10 cm
 
 
 def test_a_displaced_crop_has_the_same_points_where_both_see(views):

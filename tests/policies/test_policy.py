@@ -1,4 +1,4 @@
-"""Every method of Table II: what its loss trains, what its samples promise."""
+"""Every method of Table II: the trained parameters and the guarantees of samples."""
 
 import dataclasses
 import functools
@@ -255,7 +255,7 @@ def moved(trocar):
 def test_what_the_roll_network_reads(made, dataset, changed, matters):
     it = Made("stardiff", dataset, **changed) if changed else made("stardiff")
     params = jax.tree.map(lambda leaf: leaf + 0.01, it.params)
-    # the same positions whatever is observed
+    # the same positions for any observation
     params["learner"] = jax.tree.map(jnp.zeros_like, params["learner"])
     keys = jax.random.split(jax.random.key(0), B)
 
@@ -499,7 +499,7 @@ def test_inference_crops_as_training_did(made, dataset):
 
 
 def test_the_roll_network_of_training_is_that_of_sampling(made, monkeypatch):
-    """Positions and the newest measured roll reach it, and what it says is compared as it is."""
+    """Positions and the newest measured roll reach it, and its output is compared unchanged."""
     it = made("stardiff")
 
     def newest(self, params, p, trocar, history, seen):

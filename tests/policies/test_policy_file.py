@@ -133,7 +133,7 @@ def test_the_packaged_policy_is_whole():
     assert (found.scene, found.policy.crop_fraction) == (fakes.SCENE, 0.9)
     np.testing.assert_allclose(found.p_world_ref, [[0.0, 0.0, 0.15]], atol=1e-6)
     weights = "a136113a2624f1c184c0f15e3d4df31d000876997d05ed6cc183cfe8572d96ff"
-    assert policy_file.fingerprint(found.params) == weights  # of the training, in half precision
+    assert policy_file.fingerprint(found.params) == weights  # those of the training, halved
 
 
 def test_same_policy_same_bytes(tmp_path):
@@ -246,7 +246,7 @@ def test_every_flipped_bit_is_noticed(tmp_path, half):
         except ValueError as error:
             assert str(path) in str(error)
             continue
-        # what is left is the padding of the header
+        # the rest is the padding of the header
         assert found.policy == POLICY and found.train == trained().train
         jax.tree.map(np.testing.assert_array_equal, found.params, trained().params)
 

@@ -1,4 +1,4 @@
-"""Every public map broadcasts as its docstring says, whatever jax is told about ranks."""
+"""Every public map broadcasts as documented, under any rank promotion of jax."""
 
 import functools
 import inspect

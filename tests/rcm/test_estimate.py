@@ -93,7 +93,7 @@ def few(rng, count, noise=3e-4):
 
 @pytest.mark.parametrize("count", [3, 4, 5])
 def test_of_few_poses_it_is_the_least_squares_or_unknown(rng, estimate, count):
-    """Never a point far off that looks measured: the covariance tells how far."""
+    """Never a point far off that looks measured: the covariance covers the error."""
     found = estimate(few(rng, count))
     error = np.linalg.norm(np.asarray(found.p_world_trocar) - TRUE, axis=-1)
     known = np.asarray(found.is_determined)

@@ -1,4 +1,4 @@
-"""Every public map works, with the same values, whatever a surrounding program makes jax refuse."""
+"""Every public map works, with the same values, under every strict mode of jax."""
 
 import functools
 import os
@@ -32,7 +32,7 @@ AXES = np.array(
     [[0.0, 0.5, -1.0], [0.5, 0.25, -1.0], [-0.5, 0.0, -1.0], [0.25, -0.5, -1.0], [1, 1, 1]]
 )
 MOVING = rcm.Pose(ROTATION + AXES[..., None] * np.array([0.0, 0.0, 1.0]), POINT / 32 + AXES / 64)
-# Of each public function numbers that it takes; every axis and type that jax may refuse to mix.
+# Arguments of each public function; every axis and type that jax may refuse to mix.
 GIVEN = {
     "check_trocar": (TROCAR,),
     "insertion_depth": (POSE, POINT),
@@ -88,8 +88,8 @@ def test_all_public_functions_are_here():
 
 
 def assert_same_program(name, arrays, strict, wanted):
-    """Asserts that a strict mode compiles what jax's own settings do: it has the same values."""
-    # Error checks add to a program what they look for; without them it is the same.
+    """Asserts that a strict mode has the values of jax's own settings."""
+    # Error checks add their tests to a program; without them it is the same.
     unchecked = {k: v for k, v in strict.items() if "error_checking" not in k}
     function = FUNCTIONS[name][0]
     with mode(strict):
@@ -119,7 +119,7 @@ def test_values_are_those_of_jaxs_own_settings(name, dtype):
     def converted(*arrays):
         return function(*jax.tree.map(jnp.float32, arrays))
 
-    kind = function if name == "check_trocar" else converted  # it returns what it is given
+    kind = function if name == "check_trocar" else converted  # it returns its argument
     assert_same_program(name, arguments, STRICT, lowered(kind, arguments))
 
 

@@ -1,4 +1,4 @@
-"""Trocars: Eq. 2 and {T} against numpy, the twelve, the sampling ranges, errors that say what."""
+"""Trocars: Eq. 2 and {T} against numpy, the twelve, the sampling ranges, errors with values."""
 
 import jax
 import numpy as np

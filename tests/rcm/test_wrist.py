@@ -113,7 +113,7 @@ def test_it_is_the_dvrks_instrument(name, rng):
 
 
 def dvrk(q, offset, clevis):
-    """Frames `[N, 4, 4]` of shaft and tip at joints `[N, 6]`: modified DH of psm.json and tools."""
+    """Frames `[N, 4, 4]` of shaft, then tip, at joints `[N, 6]`, by the modified DH of psm.json."""
     half = np.pi / 2
     rows = [  # alpha, a, theta, d
         (half, 0.0, q[:, 0] + half, 0.0),

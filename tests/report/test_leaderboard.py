@@ -53,7 +53,7 @@ def test_results_of_one_policy_are_one_row_and_the_best_comes_first(folder):
     rows, others = leaderboard.read(leaderboard.find([folder]))
     best, worst = rows
     assert (best.method, worst.method) == ("STAR-Diff", "DP-EE")
-    assert (best.seen.trials, best.unseen.trials) == (400, 200)  # of 60 at each trocar
+    assert (best.seen.trials, best.unseen.trials) == (400, 200)  # first of 60 at each trocar
     assert best.others is None and best.stressed is None
     assert worst.others.trials == 200 and len(worst.commands) == 3
     assert worst.stress.keys() == {"camera", "observation_delay"}
@@ -97,7 +97,7 @@ def test_another_version_is_apart_with_a_line(folder, tmp_path, version):
     assert ours.seen and apart.seen is None and apart.version == version
     page = leaderboard_tables.markdown(rows, [])
     assert page.index("## Apart") < page.index(leaderboard_tables.reason([apart]))
-    assert page.count("DP-EE |") == 2 + 2  # of scores and of stresses
+    assert page.count("DP-EE |") == 2 + 2  # files of scores and of stresses
 
 
 def test_stresses_of_other_weights_are_not_the_policys(folder, tmp_path):

@@ -58,7 +58,7 @@ def test_any_two_methods_are_compared(several):
 
 def test_pairs_are_trials_both_ran_with_one_limit_at_one_place(several):
     first, second = several[0], several[2]
-    for angle, pairs in ((0.1, None), (4e-6, 72)):  # of a grid; of another machine
+    for angle, pairs in ((0.1, None), (4e-6, 72)):  # sweep of a grid; of another machine
         moved = [t._replace(azimuth=(t.azimuth[0] + angle,)) for t in second.trials]
         found = compare.pair(first, edited(second, moved))
         assert pairs == (found and found.pairs)

@@ -36,7 +36,7 @@ def run(out: Path) -> None:
 
 
 def main(argv: list[str]) -> int:
-    """`OUT SLOW_S FAILING`: every part takes so long to write; in one process they fail at last."""
+    """`OUT SLOW_S FAILING`: every part takes so long to write; in one process they fail."""
     import jax
 
     from starjax.runtime import files, processes

@@ -1,4 +1,4 @@
-"""Agents in closed loop: what they see and when, which commands are executed, and replays."""
+"""Agents in closed loop: observations, executed commands, and replays."""
 
 import jax
 import jax.numpy as jnp
@@ -44,7 +44,7 @@ def spy(horizon):
     """A policy whose commands spell the first and last step that it saw, and its plan's key."""
 
     def sample(params, stats, keys, observation, told):
-        seen = observation.gripper[..., 0]  # what the environment above shows: the step's number
+        seen = observation.gripper[..., 0]  # the environment above shows the step's number
         p = jnp.stack([seen[:, 0], seen[:, -1], jax.vmap(jax.random.uniform)(keys)], -1)
         shape = (len(p), horizon, 1)
         poses = Pose(
@@ -121,7 +121,7 @@ def test_no_more_commands_are_executed_than_planned():
 
 @pytest.mark.parametrize("arms", [1, 2])
 def test_a_replayed_episode_is_the_recorded_one(arms):
-    """Of an expert whose commands are executed as they are recorded."""
+    """From an expert whose commands are executed as recorded."""
     env = stubs.make_env(arms=arms, unlucky=0.0)
     expert = agent.from_single(stubs.EXPERT)
     trocars = stubs.trocars(11, arms=arms)

@@ -13,7 +13,7 @@ from starjax.rollouts import engine, ensemble, episodes
 
 HORIZON, STEPS = 4, 7
 RNG = np.random.default_rng(0)
-# Of the plan of each control step: positions, roll about the tool's axis, openings.
+# Plan of each control step: positions, roll about the tool's axis, openings.
 P = np.float32(RNG.normal((0.0, 0.0, 0.05), 0.01, (STEPS, HORIZON, 3)))
 ROLL = np.float32(RNG.normal(0.0, 0.3, (STEPS, HORIZON)))
 OPENING = np.float32(RNG.uniform(-1.0, 1.0, (STEPS, HORIZON)))
@@ -61,7 +61,7 @@ def test_what_is_executed_is_the_weighted_mean_of_all_plans_for_the_moment():
     for t in range(STEPS):
         np.testing.assert_allclose(p[t], averaged(P, t), atol=1e-7)
         np.testing.assert_allclose(opening[t], averaged(OPENING, t), atol=1e-6)
-        # Turns about one axis: the mean matrix is that of the mean turn, but for its length.
+        # Turns about one axis: the mean matrix is that of the mean turn, up to its length.
         x = averaged(turns, t)[:, 0]
         np.testing.assert_allclose(R[t][:, 0], x / np.linalg.norm(x), atol=1e-6)
         np.testing.assert_allclose(R[t].T @ R[t], np.eye(3), atol=1e-6)

@@ -15,7 +15,7 @@ from starjax.rollouts import sharing
 from starjax.runtime import processes
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-import shared_job  # it lies beside this file, for processes to run
+import shared_job  # in this folder, for processes to run
 
 SCRIPT = pathlib.Path(shared_job.__file__)
 

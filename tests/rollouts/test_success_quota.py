@@ -1,4 +1,4 @@
-"""Which trials are needed: the law, whatever the chunk, the order of ending, and what is there."""
+"""Which trials are needed: the law, for any chunk, order of ending, and saved work."""
 
 import concurrent.futures
 import itertools
@@ -11,7 +11,7 @@ from starjax.rollouts import episodes, sharing, success_quota
 
 
 class World:
-    """Trials with fates: who succeeds, and after how many segments each is over."""
+    """Trials with fates: success, and the number of segments."""
 
     def __init__(self, seed, trocars=3, rate=0.8):
         self.rng = random.Random(seed)
@@ -95,7 +95,7 @@ def test_what_is_there_stays_as_it_is(seed):
 
 
 def collected_by(world, disk, count, chunk):
-    """What this many processes write, which begin with what is on the disk."""
+    """Trials that so many processes write, from those on the disk."""
     known, written = dict(disk), []
 
     def process(index):
@@ -114,7 +114,7 @@ def collected_by(world, disk, count, chunk):
 
 @pytest.mark.parametrize("seed", range(10))
 def test_processes_that_share_collect_what_one_collects(seed, monkeypatch):
-    """Each knows of the others only what they have written."""
+    """Each reads of the others only their files."""
     monkeypatch.setattr(success_quota.sharing, "POLL_S", 0.001)
     for count, chunk in ((2, 4), (3, 2), (2, 64)):
         world = World(seed)

@@ -1,4 +1,4 @@
-"""Simulations side by side: what they yield, who is at work, and how they end."""
+"""Simulations side by side: their results, workers, and ends."""
 
 import threading
 
@@ -34,7 +34,7 @@ def test_as_many_are_at_work_together_as_asked_and_no_more():
         with lock:
             at_work += 1
             most = max(most, at_work)
-        together.wait()  # of three: fewer would break it
+        together.wait()  # limit of three: fewer would break it
         with lock:
             at_work -= 1
         yield job

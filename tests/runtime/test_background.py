@@ -1,4 +1,4 @@
-"""Work in a background thread begins at once; its result or error arrives where it is asked for."""
+"""Work in a background thread begins at once; its result or error arrives at the caller."""
 
 import threading
 
@@ -16,7 +16,7 @@ def test_work_begins_before_anybody_waits_and_its_result_is_kept():
         return threading.current_thread().name
 
     result = background.run_in_background(work)
-    assert begun.wait(10)  # while nobody waits for it
+    assert begun.wait(10)  # without a waiting caller
     may_end.set()
     assert result() == result() != threading.current_thread().name
 

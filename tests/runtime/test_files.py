@@ -1,4 +1,4 @@
-"""Files survive kills, say clearly what is wrong, and one run holds a folder."""
+"""Files survive kills, faults are named, and one run holds a folder."""
 
 import io
 import os

@@ -1,4 +1,4 @@
-"""A GPU is what jax runs on; before jax has started it is what the system and its user show."""
+"""A GPU is the device of jax; before jax has started, that of the system and its user."""
 
 import os
 import subprocess
@@ -13,7 +13,7 @@ VARIABLES = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME", "CUDA_VISIBLE_DEVICES")
 
 @pytest.fixture
 def machine(monkeypatch, tmp_path):
-    """A function that shows these devices and variables, and a plugin unless told otherwise."""
+    """A function that shows these devices and variables, and a plugin by default."""
 
     def show(*devices, plugin=True, **variables):
         monkeypatch.setattr(gpu, "_DEV", tmp_path)

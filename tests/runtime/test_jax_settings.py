@@ -15,7 +15,7 @@ import stubs
 from starjax.data import schema, store
 from starjax.runtime import jax_settings
 
-JOBS = pathlib.Path(__file__).parents[1] / "evaluation" / "test_evaluate.py"  # of stubs
+JOBS = pathlib.Path(__file__).parents[1] / "evaluation" / "test_evaluate.py"  # digest of stubs
 
 # A value other than jax's own of every setting that commands set.
 OTHERS = {
@@ -143,7 +143,7 @@ def test_a_command_scores_the_same_trials_whatever_the_environment_says(tmp_path
 def test_a_program_with_other_settings_mixes_no_trials(
     name, value, draws_others, changed, tmp_path
 ):
-    """As after a kill: half of the chunks are there, made with the usual settings."""
+    """As after a kill: half of the chunks exist, made with the usual settings."""
     run = job().run
     usual = run(tmp_path / "mixed", chunk=3)
     (tmp_path / "mixed" / "chunk_0001.npz").unlink()

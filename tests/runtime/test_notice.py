@@ -1,4 +1,4 @@
-"""A user who waits for a compiler is told so, once."""
+"""A user who waits for a compiler reads one line about it."""
 
 import time
 

@@ -63,4 +63,4 @@ def test_neither_earlier_work_nor_the_first_piece_counts_for_the_time_left(monke
     assert meter.eta() == "ETA 0:17"
     now = 100.0
     meter.add(85)
-    assert meter.per_second() == 1.0  # of all, in the end
+    assert meter.per_second() == 1.0  # sum of all, in the end

@@ -1,4 +1,4 @@
-"""Stops: training is asked to save, commands end, and what a stop waits for is said."""
+"""Stops: training saves, commands end, and the reason of a wait is printed."""
 
 import hashlib
 import os

@@ -100,7 +100,7 @@ def test_an_accepted_digest_stands_for_the_first_one(package, monkeypatch):
     monkeypatch.setattr(sources, "_accepted", lambda: {"task lid": [1, first, second]})
     assert first != second and sources.record([LID])["source"] == {"task lid": first}
     again = sources.record([LID._replace(version=2)])["source"]
-    assert again == {"task lid": second}  # of another version
+    assert again == {"task lid": second}  # digest of another version
 
 
 @pytest.mark.parametrize(

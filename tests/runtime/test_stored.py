@@ -185,7 +185,7 @@ def test_packages_that_a_part_uses_count_and_installed_ones_do_not(tmp_path, mon
     (tmp_path / "tool_part" / "tool.xml").write_text("<mujoco/>")
     (tmp_path / "help_part.py").write_text("import jax\ndef width(): return 1\n")
     monkeypatch.syspath_prepend(tmp_path)
-    # As in a folder of `pip install --target`, with a stand-in for what is not installed.
+    # As in a folder of `pip install --target`, with a stand-in for absent packages.
     target = tmp_path / "target"
     (target / "a_part-1.0.dist-info").mkdir(parents=True)
     stand_in = "class Absent:\n  def __getattribute__(self, name): raise ImportError\n"

@@ -18,7 +18,7 @@ FLAG = "--xla_cpu_use_fusion_emitters=false"
 
 def _prepared(monkeypatch, tmp_path, version, **environment):
     for name in ("XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR", SMALLEST):
-        monkeypatch.setenv(name, "")  # so that it is put back as it was, also where it was not set
+        monkeypatch.setenv(name, "")  # restores it, also if it was unset
         monkeypatch.delenv(name)
     monkeypatch.setenv("STARJAX_CACHE", str(tmp_path))
     for name, value in environment.items():

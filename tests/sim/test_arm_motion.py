@@ -66,7 +66,7 @@ def test_a_far_command_is_approached_along_the_manifold():
 
 
 def test_a_tool_at_the_least_depth_moves_along_the_manifold():
-    """Such tips are what `rcm` makes of all that are nearer to the port."""
+    """`rcm` maps all tips nearer to the port to such ones."""
     trocar = first_trocar()
     port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
     axes = jax.random.normal(jax.random.key(0), (2, 64, 3)) * jnp.array([0.4, 0.4, 0.0])
@@ -84,7 +84,7 @@ def test_a_tool_at_the_least_depth_moves_along_the_manifold():
 
 
 def test_a_command_off_the_manifold_stays_off_it():
-    """The controller is no projection: what a naive method violates, it keeps violating."""
+    """The controller does not project: a naive method's violation stays."""
     trocar = first_trocar()
     port = rcm.trocar_position(trocar, jnp.array([0.0, 0.0, 0.15]))
     good = on_manifold(trocar, jnp.array([0.0, 0.0, 0.03]), 0.0)

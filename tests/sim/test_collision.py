@@ -19,7 +19,7 @@ OUTSIDE = jnp.array([0.0, 0.0, 0.15])
 
 @pytest.fixture
 def is_hit(sim):
-    """Of a tool at `p`; the block and the peg are so far from x = 0.02."""
+    """For a tool at `p`; the block and the peg are so far from x = 0.02."""
 
     def is_hit(R, p, origins=UP, block=FAR, peg=FAR):
         there = Pose(jnp.eye(3), BLOCK + block)

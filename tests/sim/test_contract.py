@@ -24,7 +24,7 @@ A = jnp.zeros
 
 @pytest.fixture(scope="module")
 def touch():
-    """The task of a package beside starjax."""
+    """The task of another package."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(SITE)
         for module in ("starjax_toy", "starjax_toy.touch"):
@@ -152,7 +152,7 @@ def test_draws_that_are_not_of_the_key_or_not_finite_are_faults(made):
     [
         (["touch"], ("task", "touch")),
         (["disturbance", "camera"], ("disturbance", "camera")),
-        (["camera"], None),  # of two kinds
+        (["camera"], None),  # parts of two kinds
         (["toch"], None),
         ([], None),
         (["arm", "touch"], None),

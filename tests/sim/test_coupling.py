@@ -15,7 +15,7 @@ GRIPPER = -jnp.ones(1)
 
 @pytest.fixture(scope="module", params=["psm", "fr5"])
 def scene(request):
-    """A task whose forces of its own are none, and whose memory counts steps."""
+    """A task without forces, whose memory counts steps."""
     made = scenes.load(scenes.name("reach", [request.param], ["needle_driver"]))
     toy = Coupling(
         begin=lambda bound, layout, qpos, tips: (qpos, 0),

@@ -1,4 +1,4 @@
-"""The endoscope of a task: where it may be, that it sees the work, and that it is the episode's."""
+"""The endoscope of a task: its region, its view of the work, one pose for an episode."""
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from starjax.sim import env as envs
 from starjax.tasks.needle_handover import task as needle_handover
 
 TASKS = sorted(name for name in registries.tasks.names() if registries.tasks.get(name).endoscope)
-CROP = 0.9  # of the picture's side, that policies see
+CROP = 0.9  # crop of the picture's side
 
 
 def drawn(scope, count=400):
@@ -64,7 +64,7 @@ def work_of(name):
         return np.concatenate([bound.pegs, np.full((len(bound.pegs), 1), 0.005)], -1)
     if name == "ring_on_wire":  # the ring where it hangs at either end, and carried at the middle
         return np.array([[0, -0.041, 0.018], [0, 0.041, 0.018], [0, 0, 0.05]])
-    if name == "needle_handover":  # a needle of 8 mm where it may lie, and where it is passed
+    if name == "needle_handover":  # a needle of 8 mm at its start and at the pass
         (x, y), aside = needle_handover.PLACE, np.array(needle_handover.PLACE_SPREAD) + 0.008
         corners = [[x + i * aside[0], y + j * aside[1], 0] for i in (-1, 1) for j in (-1, 1)]
         return np.array([*corners, [0, 0, 0.06]])
@@ -77,7 +77,7 @@ def test_the_work_is_in_the_picture(name):
     scope = registries.tasks.get(name).endoscope
     inside = np.abs(seen(drawn(scope), work_of(name), scope)).max(-1) < CROP
     assert inside.mean() > 0.995, inside.mean()
-    # A lens at 6 cm, the nearest that was asked for, loses some.
+    # A lens at 6 cm, the nearest allowed distance, loses some.
     near = drawn(scope._replace(distance=(0.06, 0.06)))
     assert (np.abs(seen(near, work_of(name), scope)).max(-1) < CROP).mean() < inside.mean()
 

@@ -1,4 +1,4 @@
-"""The environment under the expert: success on every trocar, and trouble that stays where it is."""
+"""The environment under the expert: success on every trocar, and isolated faults."""
 
 import contacts
 import jax
@@ -119,7 +119,7 @@ def test_success_wants_a_block_let_go_and_at_rest_on_its_peg_five_steps_in_a_row
 
 @pytest.mark.slow
 def test_a_diverged_lane_is_frozen_and_leaves_its_neighbours_alone(reset, begin, drive):
-    """Bit-identical neighbours, beside NaN, infinity and a body at 1e20 m/s."""
+    """Bit-identical neighbours, next to NaN, infinity and a body at 1e20 m/s."""
     state = reset(3)
     script = begin(state, 4)
     broken = state.replace(
@@ -276,7 +276,7 @@ def test_the_expert_comes_in_from_outside_along_the_wall(reset, begin):
     normals = np.asarray(jax.vmap(task.wall_normals)(state.measurements.block))
     outward = normals[np.arange(len(normals)), np.asarray(script.wall)]
     away = np.sum(np.asarray(script.goal - state.measurements.block.p) * outward, -1)
-    # HOVER_SPREAD is left out by the mean over the twelve.
+    # The mean over the twelve removes HOVER_SPREAD.
     assert away.mean() == pytest.approx(task.RIM_RADIUS + expert.HOVER_OUT, abs=0.0015)
 
 

@@ -118,7 +118,7 @@ def test_half_a_turn_is_as_far_as_it_is(fr5, turn):
     target = Pose(pose.R @ np.diag(np.float32(turn)), pose.p)
     far = np.pi * ik.ROTATION_WEIGHT
     np.testing.assert_allclose(ik.residual(fr5, target, q), far, rtol=1e-4)
-    if turn[2] == 1:  # the jaws exchanged, which the last joint can do but for its limit
+    if turn[2] == 1:  # the jaws exchanged, which only the limit of the last joint prevents
         _, residual = ik.solve(fr5, target, q, 40)
         assert residual < 0.05 * far
 

@@ -8,7 +8,7 @@ import pytest
 from starjax.sim import mounts, registries
 from starjax.sim.arms.base import opposite
 
-# The first mount of each arm, the others where nobody waits: each is a program of its own.
+# The first mount of each arm, the others in slow tests: each is a program of its own.
 MOUNTS = [
     pytest.param(arm, tool, workspace, marks=[pytest.mark.slow] if i else [])
     for arm in registries.arms.names()

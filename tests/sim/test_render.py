@@ -1,4 +1,4 @@
-"""The ray caster against MuJoCo: its ray functions always, its GL renderer where there is GL."""
+"""The ray caster against MuJoCo: its ray functions always, its GL renderer if GL works."""
 
 import functools
 import os
@@ -21,7 +21,7 @@ from starjax.sim.arms import fr5
 from starjax.sim.camera import geometry as scenes
 from starjax.sim.camera import rays, tiles
 
-# Every primitive, tilted, in a pile, with what must not be drawn: groups 3 and up, alpha 0, sites.
+# Every primitive, tilted, in a pile, with hidden geoms: groups 3 and up, alpha 0, sites.
 PILE = """
 <mujoco>
   <visual>
@@ -368,7 +368,7 @@ def test_a_moving_camera_sees_what_a_fixed_one_sees_from_there(compose):
     same = np.asarray(moved.segmentation) == fixed.segmentation
     assert same.mean() > 0.999
     off = np.abs(np.asarray(moved.rgb).astype(int) - fixed.rgb).max(-1)
-    assert off.mean() < 0.5  # of 255: the edges of the checkers are smoothed otherwise
+    assert off.mean() < 0.5  # levels of 255: the edges of the checkers are smoothed otherwise
 
 
 def test_a_camera_that_moves_sees_the_scene_turn():

@@ -209,7 +209,7 @@ def test_a_scene_of_many_velocities_runs(large):
     for _ in range(10):
         state = step(state, Command(state.pose, state.gripper))
     assert not state.invalid and state.solver_error < dynamics.max_solver_error(env.scene)
-    heights = state.physics.qpos[2:63:7]  # of the balls, whose radius is 4 mm
+    heights = state.physics.qpos[2:63:7]  # depth of the balls, whose radius is 4 mm
     assert ((heights > 0.003) & (heights < 0.005)).all()
 
 

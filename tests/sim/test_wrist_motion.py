@@ -1,4 +1,4 @@
-"""An arm that holds a wrist: its shaft keeps to the trocar, whatever the tip does."""
+"""An arm that holds a wrist: its shaft keeps to the trocar, for any motion of the tip."""
 
 import functools
 

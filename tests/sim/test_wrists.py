@@ -12,7 +12,7 @@ from starjax.sim import registries, scene, wrists
 from starjax.sim import rescuer as rescue
 
 REACH = registries.tasks.get("reach")
-# Of no package, so its wrist is that of the record.
+# Without a package, so its wrist is that of the record.
 TASK = REACH._replace(
     name="bent", slots=tuple(slot._replace(tool="needle_driver") for slot in REACH.slots)
 )

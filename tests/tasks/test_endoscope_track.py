@@ -1,4 +1,4 @@
-"""The endoscope: where its camera is, what is on target, and when a trial is over."""
+"""The endoscope: pose of its camera, test of its target, end of a trial."""
 
 from types import SimpleNamespace
 

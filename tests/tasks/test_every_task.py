@@ -56,7 +56,7 @@ def test_a_task_is_what_it_says(name):
 
 
 def said_by_parts(task, limit):
-    """What each part's MJCF, and what that includes, adds to a limit of the scene."""
+    """Contribution of each part's MJCF, with included files, to a limit of the scene."""
     parts = [assets.path(task.mjcf)]
     for slot in task.slots:
         parts += [assets.path(registries.arms.get(slot.arm).mjcf)]
@@ -114,7 +114,7 @@ def test_the_expert_of_a_task_succeeds(name):
 
 
 def enters_like_the_expert(agent, rescuer, keys, state):
-    """At reset an expert that starts in any state does what the demonstrator does."""
+    """At reset an expert that starts in any state equals the demonstrator."""
 
     @jax.jit
     @jax.vmap

@@ -1,4 +1,4 @@
-"""Needle hand-over: who has held the needle, slip, drops, and what they make of a trial."""
+"""Needle hand-over: holders of the needle, slip, drops, and the trial's outcome."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""The ring and its wire: as in the model, and what counts as touching, as the end, as done."""
+"""The ring and its wire: as in the model; tests of touch, end and success."""
 
 import jax
 import jax.numpy as jnp

@@ -78,7 +78,7 @@ def test_six_blocks_stand_side_by_side_at_any_yaw():
     assert apart.min() > 2 * max(ends) - COLLISION
 
 
-YAWS = np.linspace(-0.5, 0.5, 7)  # rad, of what is handed over
+YAWS = np.linspace(-0.5, 0.5, 7)  # rad, of the handed object
 # What each expert's tools hold: segments of the wire; the wall's normal and its direction.
 HELD = {
     handover: jnp.array([2, 4]),
@@ -88,7 +88,7 @@ HELD = {
 
 @pytest.mark.parametrize("expert", HELD, ids=lambda expert: expert.__name__.split(".")[-2])
 def test_a_tool_first_turns_on_a_way_that_says_how(expert):
-    """A roll network sees the coming path of its arm, and not what is to be grasped."""
+    """A roll network sees the coming path of its arm, not the object."""
     tips = jnp.array(handover.PARK)
     script = types.SimpleNamespace(p=tips, held=HELD[expert])
 

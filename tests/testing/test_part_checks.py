@@ -34,7 +34,7 @@ ROW = methods.METHODS["dp_rcm4"]
     ("row", "expected"),
     [
         (ROW._replace(weights_of="mine"), []),
-        (ROW, []),  # of the method itself
+        (ROW, []),  # label of the method itself
         (ROW._replace(action_space="rcm5"), ["action space"]),
         (ROW._replace(sees_trocar=False), ["weights"]),
         (ROW._replace(weights_of="nobody"), ["weights"]),

@@ -117,7 +117,7 @@ def devices_main(count: int, out: str, observation: str, dtype: str) -> None:
     from starjax.training.state import step_keys
 
     assert len(jax.devices()) == count
-    # so that this small policy has some, as on GPUs
+    # this small policy has some, as on GPUs
     sharding.LARGE, packed_params.PLATFORMS = 256, {"cpu"}
     settings = dataclasses.replace(SETTINGS, holdout_demos=0)
     state = train(Path(out), settings, observation=observation, dtype=dtype).state
@@ -130,7 +130,7 @@ def devices_main(count: int, out: str, observation: str, dtype: str) -> None:
 
 
 def processes_main(out: str, asks: int) -> None:
-    """Trains as one process of several; the first is told to stop at its `asks`th question."""
+    """Trains as one process of several; the first stops at its `asks`th question."""
     import itertools
 
     import jax
@@ -186,7 +186,7 @@ def feed_main(out: str) -> None:
 
 def run_main(out: str, mode: str) -> None:
     """Is one process of several of `starjax run`: `waits` before it, `trains` without an end until
-    it is told to stop, or does the `whole` of a run with a stub of the simulator."""
+    it stops, or does the `whole` of a run with a stub of the simulator."""
     import jax
     import stubs
 

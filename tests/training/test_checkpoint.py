@@ -147,7 +147,7 @@ def test_full_disk_is_one_sentence(three, monkeypatch):
     monkeypatch.setattr(checkpoint.ocp, "save", full)
     with pytest.raises(files.StorageError, match=r"no space left.*step 40.*from step 30"):
         checkpoint.save(three, 40, state(40), keep=2)
-    # gone on from 20, as 30 is damaged
+    # continued from 20, as 30 is damaged
     with pytest.raises(files.StorageError, match=r"no space left.*step 25.*from step 20"):
         checkpoint.save(three, 25, state(25), keep=2)
     assert checkpoint.steps(three) == [20, 30]

@@ -156,7 +156,7 @@ def test_torchvision_fills_a_trunk_only(tmp_path):
 
 
 def test_torchvision_still_starts_a_policy(tmp_path):
-    """The trunk's first kernel is the file's, what torchvision does not have stays."""
+    """The trunk's first kernel is the file's, layers that torchvision lacks stay."""
     vision = encoders.ImageEncoder(trunk="resnet18", features=16)
     shapes = jax.eval_shape(vision.init, jax.random.key(0), jnp.zeros((1, 64, 64, 3)))
     begun = {"vision": jax.tree.map(lambda x: jnp.full(x.shape, 0.25), shapes)}

@@ -1,4 +1,4 @@
-"""A frozen encoder: what it saw is what inference sees, and nothing ever changes it."""
+"""A frozen encoder: training and inference share its inputs, and its weights stay."""
 
 import dataclasses
 import functools
@@ -70,7 +70,7 @@ def features(source, dataset, root, digest="demos", camera="camera", frames=None
 
 
 def never():
-    raise AssertionError("the pictures were asked for")
+    raise AssertionError("the pictures were requested")
 
 
 def test_a_run_waits_for_the_features_that_another_one_computes(source, dataset, tmp_path):
@@ -172,7 +172,7 @@ def run_config(settings, out):
 
 
 def train(source, seen, out, name):
-    """What `starjax train` does after the features are there."""
+    """The part of `starjax train` after the features."""
     settings, found = source
     work = pipeline.RunContext(run_config(settings, out), found, sharing.ALONE, "")
     vars(work)["env"] = fakes.env()  # in place of the cached one
@@ -269,7 +269,7 @@ def test_pictures_in_the_place_of_features_are_an_error(source, dataset, tmp_pat
 
 
 def test_every_frame_has_its_own_features(source, dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr(frozen, "PART", 30)  # of batches that its end cuts
+    monkeypatch.setattr(frozen, "PART", 30)  # parts of batches that its end cuts
     settings, found = source
     see = functools.partial(frozen._see_program(settings), found.params)
     pictures = np.asarray(dataset.observation.images["camera"])

@@ -41,7 +41,7 @@ def test_errors_are_in_their_units_and_rolls_go_round_the_circle():
         pose = Pose(rcm.rotation_z(jnp.deg2rad(roll_deg)), jnp.array([x, 0.0, 0.0]))
         return Command(pose, jnp.float32(gripper))
 
-    port = jnp.array([0.0, 0.004, 0.1])  # of a shaft along z, 5 and 4 mm beside it
+    port = jnp.array([0.0, 0.004, 0.1])  # points 5 and 4 mm from a shaft along z
     found = holdout.action_errors(command(0.003, 179.0, 1.0), command(0.0, -179.0, -1.0), port)
     wanted = {"position_error_mm": 3.0, "roll_error_deg": 2.0, "gripper_error": 2.0}
     wanted["rcm_error_mm"] = 5.0

@@ -26,7 +26,7 @@ from starjax.runtime import files, precompile, signals
 from starjax.training import batches, checkpoint, log, loop, start, state, step
 
 sys.path.insert(0, str(Path(__file__).parent))
-import jobs  # it lies beside this file, for processes to run
+import jobs  # in this folder, for processes to run
 
 
 def leaves(tree):
@@ -174,7 +174,7 @@ def test_interrupted_and_resumed_is_the_same_run(whole, tmp_path):
 
 @pytest.mark.slow
 def test_only_the_state_is_held_while_steps_are_taken(whole, tmp_path):
-    """A matrix, its two moments and its average; not what they began with, too."""
+    """A matrix, its two moments and its average; not their initial values, too."""
     largest = max(leaves(whole[1].state.params), key=np.size).shape
 
     def held():

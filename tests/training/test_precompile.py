@@ -16,7 +16,7 @@ from starjax.policies import features
 from starjax.training import loop, precompile, start, step
 
 sys.path.insert(0, str(Path(__file__).parent))
-import jobs  # it lies beside this file, for processes to run
+import jobs  # in this folder, for processes to run
 
 SEES = dataclasses.replace(fakes.TINY, observation="image")
 

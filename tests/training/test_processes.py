@@ -24,7 +24,7 @@ from starjax.runtime import processes
 from starjax.training import batches, checkpoint, log, loop
 
 sys.path.insert(0, str(Path(__file__).parent))
-import jobs  # it lies beside this file, for processes to run
+import jobs  # in this folder, for processes to run
 import test_batches
 
 

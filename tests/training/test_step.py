@@ -30,7 +30,7 @@ SETTINGS = config.TrainConfig(
 
 
 def regression():
-    """A policy of one parameter that learns the mean position; its loss is NaN where told."""
+    """A policy of one parameter that learns the mean position; its loss is NaN on request."""
 
     def init(key):
         return {"w": jax.random.normal(key, (3,))}
@@ -137,7 +137,7 @@ def test_matrices_rounded_by_the_step_before_are_those_of_the_parameters(dataset
     looped, called = it.to_state(many(it.to_carry(first), 3)), it.to_state(called)
     chex.assert_trees_all_close((looped.params, looped.sums), (called.params, called.sums))
     moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), looped.params, first.params)
-    assert min(jax.tree.leaves(moved)) > 5e-4  # of three steps of the learning rate
+    assert min(jax.tree.leaves(moved)) > 5e-4  # sum of three steps of the learning rate
 
 
 def test_a_broken_loss_is_left_out_and_counted(start, dataset):

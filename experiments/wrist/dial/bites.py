@@ -1,4 +1,4 @@
-"""The dial: how far a needle turns decides if one grasp serves every trocar.
+"""The dial: the turn of a needle decides if one grasp serves every trocar.
 
     python experiments/wrist/dial/bites.py [--tiny]
 

@@ -4,7 +4,7 @@
         [--seed 2026] [--c] [--tiny]
 
 The task is needle drive along the dial. One expert (`default`) drives each needle in a plane that
-suits the trocar, the other (`one_plane`) in one plane for all. Beside the successes stand the
+suits the trocar, the other (`one_plane`) in one plane for all. A second column has the
 episodes whose wrist stays within its limits in that plane, in closed form.
 """
 

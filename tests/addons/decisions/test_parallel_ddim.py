@@ -13,7 +13,7 @@ NOISE = jnp.asarray(np.random.default_rng(0).normal(size=(2, 16, 4)), jnp.float3
 
 
 def at(table, k, x):
-    """Entries k (`[]` or `[n]`) of a table, beside `x` (`[B, H, A]` or `[n, B, H, A]`)."""
+    """Entries k (`[]` or `[n]`) of a table, broadcast to `x` (`[B, H, A]` or `[n, B, H, A]`)."""
     return jnp.asarray(table)[k].reshape(-1, *(1,) * (x.ndim - 1))
 
 

@@ -16,7 +16,7 @@ def inputs(*shape, seed=1):
 
 
 def made(module, *given):
-    """Its parameters, none of them zero or one, and what they make of the given."""
+    """Its parameters, none of them zero or one, and their output."""
     params = jax.jit(module.init)(jax.random.key(0), *given)["params"]
     leaves, tree = jax.tree.flatten(params)
     params = tree.unflatten([x + 0.3 * inputs(*x.shape, seed=i) for i, x in enumerate(leaves)])
@@ -42,7 +42,7 @@ def sample(module, params, *given):
     [*((5, length, 8) for length in (16, 3, 2, 1)), (3, 2, 8), (1, 4, 8), (5, 16, 12), (5, 1, 12)],
 )
 def test_a_block_is_the_same_function(kernel, length, channels):
-    """With a convolution beside the first one, from 8 channels to 12, and without."""
+    """With a convolution parallel to the first one, from 8 channels to 12, and without."""
     module = unet1d.ResidualBlock(12, kernel, GROUPS)
     given = inputs(3, length, channels), inputs(3, 24, seed=2)
     params, expected = made(module, *given)

@@ -12,7 +12,7 @@ from starjax.policies.monitor import record, scores
 
 SETTINGS = scores.ScoreSettings(execute=8, control_hz=30.0, still=6)
 S, CLOCK = len(scores.NAMES), scores.NAMES.index("clock")
-UNITS = np.array([1e-3, 5.0, 0.1, 1e-3, 0.5])  # of the scores without the clock
+UNITS = np.array([1e-3, 5.0, 0.1, 1e-3, 0.5])  # limits of the scores without the clock
 
 
 def trials(rng: np.random.Generator, count: int, longest: int = 30) -> np.ndarray:
@@ -144,7 +144,7 @@ def test_json_round_trip_and_refusals():
 def test_a_monitor_of_other_scores_alarms_on_these_alone():
     rng = np.random.default_rng(9)
     center, width = calibration.fit(trials(rng, 200))
-    names = ["disagreement", "stillness", "clock"]  # of the first version
+    names = ["disagreement", "stillness", "clock"]  # names of the first version
     values = record.to_json(made(rng)) | {"scores": names, "threshold": 0.0}
     values |= {"center": center[:3].tolist(), "width": width[:3].tolist()}
     found = record.from_json(values)

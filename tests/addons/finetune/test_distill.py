@@ -63,7 +63,7 @@ def test_the_student_comes_nearer_to_its_flow():
         student, errors = learned(visited)
         assert errors[-1] < 0.9 * errors[0], errors
         found.append(float(jnp.mean((policy.generate(student, stats, keys, *far) - goal) ** 2)))
-    assert found[1] < 0.8 * found[0], found  # it comes nearer where it has been
+    assert found[1] < 0.8 * found[0], found  # it comes nearer at visited states
     jax.tree.map(np.testing.assert_array_equal, params, before)
 
 

@@ -36,7 +36,7 @@ from starjax.sim import registries
 HORIZON = fakes.TINY.horizon
 TRAIN = config.TrainConfig(batch_size=8, learning_rate=0.5, holdout_demos=1, log_every=6)
 DEMOS = config.DemosConfig(per_trocar=2, seen_trocars=4, max_steps=100)
-TOO_SHORT = 0.93  # of the way to a goal: near ones are reached
+TOO_SHORT = 0.93  # fraction of the path to a goal: near ones are reached
 
 
 def goes(params, observation):

@@ -1,4 +1,4 @@
-"""Demonstrations and rollouts as one dataset: what is drawn, and what a normaliser keeps."""
+"""Demonstrations and rollouts as one dataset: draws of a batch, and the normaliser."""
 
 import dataclasses
 import tracemalloc

@@ -62,7 +62,7 @@ PARKED = (0.05, 0.0, 0.02)  # m, a tool that waits or has gone
         (PARKED, GIVER, (FULL, OPEN), (0.0, 0.0, 0.0), "near"),
         ((0.004, -0.003, 0.012), GIVER, (FULL, OPEN), (0.0, 0.0, 0.0), "meet"),
         ((0.001, 0.0, 0.004), GIVER, (FULL, OPEN), (0.0, 0.0, 0.0), "meet"),
-        ((0.004, 0.0, 0.002), GIVER, (FULL, OPEN), (0.0, 0.0, 0.0), "near"),  # from beside it
+        ((0.004, 0.0, 0.002), GIVER, (FULL, OPEN), (0.0, 0.0, 0.0), "near"),  # next to it
         ((0.001, 0.0, 0.004), GIVER, (FULL, EMPTY), (0.0, 0.0, 0.0), "near"),  # closed too high
         ((0.0, 0.0, 0.001), BOTH, (FULL, FULL), (0.0, 0.0, 0.0), "open"),
         ((0.0, 0.0, 0.001), TAKER, (OPEN, FULL), (0.0, 0.0, 0.0), "away"),

@@ -61,7 +61,7 @@ def learned(env, policy, params, stats, static, rate, iterations, demonstrations
     return learning.params, found
 
 
-SHORT = 0.9  # of the way to a goal: near ones are reached
+SHORT = 0.9  # fraction of the path to a goal: near ones are reached
 NOISE = 0.01
 STATIC = explore.ExploreSettings(obs_horizon=1, execute=8, decisions=5)
 
@@ -168,7 +168,7 @@ def test_an_experience_is_what_happened(demonstrations):
     mean = goes(STOPS_SHORT.init(None), None, None, flat, None)
     noise = (played.action.reshape(mean.shape) - mean)[np.asarray(played.alive).reshape(-1)]
     assert abs(float(noise.std()) / NOISE - 1) < 0.05 and abs(noise.mean()) < 1e-3
-    np.testing.assert_allclose(noise, noise[:, :1].repeat(8, 1), atol=1e-6)  # of a whole plan
+    np.testing.assert_allclose(noise, noise[:, :1].repeat(8, 1), atol=1e-6)  # a whole plan
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Takeovers before the progress ended: where a trial is branched, and which branch is learned."""
+"""Takeovers before the progress ended: the branches of a trial, and the learned one."""
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ SETTINGS = rounds.RoundSettings(0, 3, 6, 240, "", "digest", {})
 
 
 def gains_until_then():
-    """The stub with a reward that grows up to a step, whatever the tip does."""
+    """The stub with a reward that grows up to a step, for any tip."""
     env = stubs.make_env(unlucky=0.0)
 
     def step(state, command):

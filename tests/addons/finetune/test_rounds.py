@@ -20,7 +20,7 @@ SETTINGS = rounds.RoundSettings(0, 3, 6, 60, "", "digest", {"limits": LIMITS._as
 
 
 def stay(params, stats, keys, observation, trocar):
-    """A policy that stays where it is."""
+    """A policy that does not move."""
     pose = jax.tree.map(lambda x: jnp.repeat(x[:, -1:], IDLE, 1), observation.pose)
     return Command(pose, -jnp.ones(pose.p.shape[:-1]))
 

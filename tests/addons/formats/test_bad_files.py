@@ -22,7 +22,7 @@ NAMES = base.writable()
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory):
-    """Format -> a small export with images, by video where there is any."""
+    """Format -> a small export with images, by video if the format has it."""
     return {
         name: fuzz_formats.prepared(tmp_path_factory.mktemp(name), name, whole=True)
         for name in NAMES
@@ -40,7 +40,7 @@ def copy(sound, tmp_path):
 
 
 def refused(path, name):
-    """The line that reading all of it ends in."""
+    """The error of reading a whole file."""
     with pytest.raises(errors.UsageError) as caught, base.open_dataset(path, name) as source:
         for episode in range(len(source.lengths)):
             source.read(episode, source.columns)

@@ -75,7 +75,7 @@ SLIPS = {
         "gripper",
     ),
     "shaft reversed": ("shafts, trocars", changed_arm(tip_turn=REVERSED), None, "before the"),
-    "shaft beside": (
+    "shaft next to": (
         "shafts, trocars",
         changed_arm(trocar="at"),
         added(at=lambda a: np.tile(TROCARS[0] + [0.01, 0.0, 0.0], (len(a["p0"]), 1))),
@@ -178,6 +178,6 @@ def test_values_that_nothing_can_be_made_of_are_refused(tmp_path, name):
 def test_the_pages_tables_have_a_row_for_each(header, cases):
     table = PAGE.read_text().partition(f"| Compared | {header} |\n")[2].partition("\n\n")[0]
     rows = set(re.findall(r"^\| (.+?) \| ", table, re.MULTILINE)) - {"|---|---|"}
-    # Of files, see test_bad_files.py, and of models, see above.
+    # For files, see test_bad_files.py, and of models, see above.
     others = {"sizes in headers, memory", "joints of a model, columns"}
     assert rows - others == {case[0] for case in cases.values()}

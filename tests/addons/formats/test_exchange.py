@@ -1,4 +1,4 @@
-"""`starjax export`, `import`, `inspect` and `--demos.from`: what they write and say; mistakes."""
+"""`starjax export`, `import`, `inspect` and `--demos.from`: their output and mistakes."""
 
 import dataclasses
 import json
@@ -103,7 +103,7 @@ def test_inspect_reads_policies_and_results(request):
 
 
 def _edit(root, name, change):
-    """An episode written again, so that its hashes are right."""
+    """An episode written again, with correct hashes."""
     key = store.keys(root)[0]
     record = store.verify(root, key)
     arrays = {n[:-4]: np.load(root / "episodes" / key / n) for n in record["files"]}

@@ -21,7 +21,7 @@ LANES = 3
 
 @pytest.fixture(autouse=True)
 def simulated(monkeypatch):
-    """A point mass, so that programs compile in a second."""
+    """A point mass: programs compile in a second."""
 
     def make(*_, observation, **__):
         made = stubs.make_env(observation, unlucky=0.0)

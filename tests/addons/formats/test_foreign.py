@@ -1,4 +1,4 @@
-"""Demonstrations of others: whatever their conventions, the same dataset; anomalies are said."""
+"""Demonstrations of others: one dataset for all conventions; anomalies are reported."""
 
 import json
 import shutil
@@ -100,7 +100,7 @@ def written_as(kind):
 @pytest.mark.parametrize("kind", mapping.NUMBERS)
 @pytest.mark.parametrize("hz", [30.0, 50.0])
 def test_every_way_to_write_a_rotation_is_the_same_motion(kind, hz):
-    """At another rate too, where what wraps would be averaged."""
+    """At another rate too, at which wrapped angles would be averaged."""
     given = source(hz=hz, change=written_as(kind))
     made = structs.replace(MAP, arms=(structs.replace(ARM, rotation_as=kind),))
     found = motion.read(given.read(0, mapping.names(made)), made, hz, None)
@@ -332,7 +332,7 @@ def test_the_trocar_of_an_instrument_with_a_wrist_is_that_of_its_shaft(tmp_path,
     assert not got.notes and got.residual_mm.max() < 0.02
     root = tmp_path / "d"
     error = np.load(root / "episodes" / store.keys(root)[0] / "rcm_error.npy")
-    assert error.max() < 5e-5  # of the shaft
+    assert error.max() < 5e-5  # pose of the shaft
     shaft = np.load(root / "episodes" / store.keys(root)[0] / "shaft_p.npy")[:, 0]
     _, p, _ = moved(np.arange(len(shaft)) / 30, TROCARS[0], 0)
     np.testing.assert_allclose(shaft, p, atol=3e-5)

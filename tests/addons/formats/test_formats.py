@@ -1,4 +1,4 @@
-"""Exports and imports: back as they were, with the columns that peers expect, whatever happens."""
+"""Exports and imports: back as they were, with the columns that peers expect, also after a kill."""
 
 import importlib.metadata
 import json
@@ -189,7 +189,7 @@ def test_an_edited_export_is_read_by_our_columns(exported, roots, tmp_path, kind
     assert kind == "two_arms" or not found.notes
     has_shaft = "shaft_p" in store.read_description(tmp_path / "d")["features"]
     assert has_shaft == (kind == "wrist")
-    if kind == "images":  # of the task's cameras
+    if kind == "images":  # one of the task's cameras
         roots_of = (roots / kind, tmp_path / "d")
         one, other = (load.frames(root)[recorded.CAMERAS[0]].read() for root in roots_of)
         np.testing.assert_array_equal(other, one[rows])
@@ -458,7 +458,7 @@ def test_a_broken_format_leaves_the_others(tmp_path, monkeypatch):
     (tmp_path / "d" / "meta" / "info.json").touch()
     assert base.detect(tmp_path / "d") == "lerobot"
     with pytest.warns(UserWarning, match="skipped"), pytest.raises(errors.UsageError):
-        base.detect(tmp_path)  # of no format: the broken ones are asked too
+        base.detect(tmp_path)  # a file of no format: the broken ones are asked too
 
 
 def test_a_format_of_two_packages_fails_alone(tmp_path, monkeypatch):

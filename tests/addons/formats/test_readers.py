@@ -1,4 +1,4 @@
-"""Readers of peers' files: what was written is read, and a bag of CRTK topics is imported."""
+"""Readers of peers' files: the written values are read, and a bag of CRTK topics is imported."""
 
 import io
 import shutil

@@ -19,7 +19,7 @@ WRISTED = {"open-h-stanford", "open-h-ucb"}
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    """Name -> (its LeRobot folder, what the import of the chosen mapping found, the dataset)."""
+    """Name -> (its LeRobot folder, findings of the import by the chosen mapping, the dataset)."""
     made = {}
 
     def find(name):
@@ -96,7 +96,7 @@ def _number(record):
 def test_texts_are_kept(written):
     *_, root = written("open-h-dvrk")
     about = json.loads((root / schema.IMPORTED).read_text())
-    depth, squeezed = about["columns"]  # depth, which nobody maps
+    depth, squeezed = about["columns"]  # depth, which no mapping names
     assert "depth" in depth and "side" in squeezed and not about["notes"]
     texts = about["texts"]
     assert texts["instruction.text"] == {"pick up the needle": 4}

@@ -1,4 +1,4 @@
-"""Commands relative to the measured pose are those that are told absolutely."""
+"""Commands relative to the measured pose equal the absolute ones."""
 
 import msgspec
 import numpy as np

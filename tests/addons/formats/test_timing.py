@@ -42,7 +42,7 @@ def test_a_sound_recording_has_no_note(tmp_path, name):
 
 
 def rate(name):
-    """Times of 100 Hz beside a rate of 30 Hz."""
+    """Times of 100 Hz with a rate of 30 Hz."""
     made = several.mapping(name, time=(), hz=30.0)
     return recording(hz=100.0), made, "100 Hz", name not in ("csv", "aloha", "rosbag")
 

@@ -1,4 +1,4 @@
-"""Images that went through a video are what they were, whoever wrote it."""
+"""Images survive a video of any writer."""
 
 import fractions
 

@@ -2,7 +2,7 @@
 
     python tests/addons/peers/openpi.py PEER_PYTHON
 
-PEER_PYTHON is a Python with `openpi-client` (and `typing_extensions`, which it forgets to ask for);
+PEER_PYTHON is a Python with `openpi-client` (and `typing_extensions`, a requirement that it omits);
 it needs numpy below 2, so it lives in an environment of its own. Without it nothing is run.
 """
 
@@ -35,7 +35,7 @@ def asked(image_size):
 
 
 def peer(port):
-    """In the peer's Python: prints what its client got, as JSON."""
+    """In the peer's Python: prints the answers of its client, as JSON."""
     from openpi_client import action_chunk_broker, websocket_client_policy
 
     client = websocket_client_policy.WebsocketClientPolicy("127.0.0.1", port, api_key=KEY)
@@ -92,7 +92,7 @@ def main(python):
 
 
 def compare(said):
-    """What the peer got beside the call in this process."""
+    """Answers of the peer and of a call in this process."""
     import jax
 
     from starjax import deploy, rcm

@@ -1,4 +1,4 @@
-"""Opens an export with LeRobot's own loader; prints what it reads as JSON. Runs where that is."""
+"""Opens an export with LeRobot's own loader; prints its content as JSON. Runs where that is."""
 
 import json
 import sys

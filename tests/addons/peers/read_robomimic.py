@@ -1,4 +1,4 @@
-"""Opens an export with robomimic's own dataset; prints what it reads. Runs where that is."""
+"""Opens an export with robomimic's own dataset; prints its content. Runs where that is."""
 
 import json
 import sys

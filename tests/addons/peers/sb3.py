@@ -70,7 +70,7 @@ class Lanes(VecEnv):
                 "TimeLimit.truncated": bool(truncated[i]),
                 "is_success": bool(info["final_info"]["is_success"][i]),
             }
-        # scaled, so that values are of order one
+        # scaled to values of order one
         return seen, (1 - GAMMA) * reward.astype(np.float32), over, infos
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""A SpaceMouse that is not there: its HID reports, through pyspacemouse, to a tool in the trocar.
+"""A simulated SpaceMouse: its HID reports, through pyspacemouse, to a tool in the trocar.
 
 Needs `pyspacemouse`, which no extra brings; the HID library under it is replaced. Run as a script,
 or by pytest, which skips it where something is missing.
@@ -20,7 +20,7 @@ class Unplugged(Exception):
 
 
 class Fake:
-    """A SpaceMouse Compact that sends what it is told to."""
+    """A SpaceMouse Compact that sends given values."""
 
     vendor_id, product_id = COMPACT
     product_string, manufacturer_string = "SpaceMouse Compact", "3Dconnexion"

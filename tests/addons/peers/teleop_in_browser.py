@@ -29,7 +29,7 @@ ARGS = [
     "--disable-sync",
 ]
 KEYS = (("ArrowUp", "ArrowDown"), ("ArrowRight", "ArrowLeft"), ("PageUp", "PageDown"))
-SIGNS = (-1, 1, 1)  # of world x, y, z: away from the person who looks at the picture is -x
+SIGNS = (-1, 1, 1)  # signs of world x, y, z: away from the person who looks at the picture is -x
 STEP = 1.5  # mm a stroke
 PATIENCE_S = 90
 VIEW = {"width": 480, "height": 360}  # small: it is drawn without a GPU

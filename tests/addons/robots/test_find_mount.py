@@ -1,4 +1,4 @@
-"""`starjax find-mount`: what it searches for, prints, and refuses."""
+"""`starjax find-mount`: its search, output and refusals."""
 
 import mistakes
 import numpy as np

@@ -14,7 +14,7 @@ OFFSETS = {"needle_driver": 0.4162, "prograsp": 0.4670}
 
 # Ranges and largest torques of kinematic/psm.json, psm-si.json, and of both tools' descriptions:
 # outer yaw, pitch, insertion; roll, wrist pitch and yaw. The yaw of psm.json has whole turns: that
-# of the user guide, +-91 degrees, in its place.
+# range of the user guide, +-91 degrees, in its place.
 RANGES = {
     "psm": [(-1.5882, 1.5882), (-0.925025, 0.925025), (0.0, 0.24)],
     "psm_si": [(-2.964, 2.964), (-1.265, 1.301), (0.0, 0.29)],

@@ -1,4 +1,4 @@
-"""Six blocks in one episode: whose turn it is, what stands still, and the way between. No physics:
+"""Six blocks in one episode: turns of the tools, resting parts, the path between. No physics:
 a block is put down at its peg whenever the tools have withdrawn for so many control steps."""
 
 import jax

@@ -145,7 +145,7 @@ def test_strict_is_on_both_marks_gently_and_out(case, is_strict):
 
 
 def at(bound, layout, turn, height=0.0, **events):
-    """A state of a needle on its path at `turn` rad, lifted by `height` m, its tip where it is."""
+    """A state of a needle on its path at `turn` rad, lifted by `height` m, its tip unchanged."""
     pose = needles.pose_on(bound.size, layout.bite, jnp.asarray(turn))
     pose = pose._replace(p=pose.p.at[2].add(height))
     tip = wrist_script.tip_of(pose, grasps.grasp(bound.size))

@@ -175,7 +175,7 @@ def test_a_rescued_needle_is_lifted_high_enough_and_let_go_if_it_is_askew(
     state = stubs.one_tool(fallen._replace(R=R), askew, layout)
     command, script, _ = rescue.RESCUER.act(script, state)
     assert int(script.phase) == phase and (float(command.gripper[0]) == -1.0) == (turn == 0.0)
-    off = float(square.p[2] - layout.needle.p[2])  # of the wire there from the needle's centre
+    off = float(square.p[2] - layout.needle.p[2])  # offset of the wire from the centre
     up = float(script.goal[2] - fallen.p[2])
     assert up >= least - off - 1e-6
 

@@ -117,7 +117,7 @@ def test_the_point_is_turned_out_at_every_trocar_with_room_for_the_wrist():
     found = jax.jit(jax.vmap(worst))(
         at[rows[0]], *(jnp.asarray(x, jnp.float32) for x in rows[1:3]), jnp.asarray(rows[3])
     )
-    assert np.rad2deg(found).max() < 77.0  # of 80
+    assert np.rad2deg(found).max() < 77.0  # out of 80
 
 
 NEAR, FIRST, SECOND, FREE = "as for driving", "first", "second", ""

@@ -1,4 +1,4 @@
-"""A person relieves a policy: who acted is recorded, and fine-tuning takes the episode."""
+"""A person relieves a policy: the actor is recorded, and fine-tuning learns the episode."""
 
 import jax.numpy as jnp
 import mistakes

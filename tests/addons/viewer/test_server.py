@@ -83,7 +83,7 @@ def test_sliders_and_handles_of_trocars_follow_each_other(page, name):
     assert np.abs(drawn - p).max() > 1e-4
     for slot, one in zip(task.slots, drawn):
         np.testing.assert_allclose(handles.within(slot, one), one, atol=1e-5)
-    # Sliders are at the trocar, whichever turn its azimuth counts from.
+    # Sliders are at the trocar, for any turn of its azimuth.
     for azimuth in (-10.0, 0.0, 10.0, 350.0):
         angle = np.full(task.arms, np.radians(azimuth))
         wide = rcm.Trocar(np.full(task.arms, 0.03), np.full(task.arms, 1.5), angle)

@@ -1,4 +1,4 @@
-"""The learner `act`: its mathematics by hand, and what its samples return."""
+"""The learner `act`: its mathematics by hand, and its samples."""
 
 import dataclasses
 
@@ -46,7 +46,7 @@ def test_styles_are_drawn_from_their_distribution():
 
 
 def test_attention_is_the_softmax_of_products():
-    """One layer whose MLP and norms do nothing, beside numpy."""
+    """One layer whose MLP and norms do nothing, against numpy."""
     layer = transformer.Layer(heads=1, mlp=4)
     x = jax.random.normal(jax.random.key(1), (1, 3, 4))
     params = layer.init(jax.random.key(2), x)["params"]

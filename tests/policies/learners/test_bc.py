@@ -1,4 +1,4 @@
-"""The learner `bc`: its loss by hand, and what its samples return."""
+"""The learner `bc`: its loss by hand, and its samples."""
 
 import fakes
 import jax

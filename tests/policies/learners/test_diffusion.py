@@ -1,4 +1,4 @@
-"""The learner `diffusion`: what its loss learns, its samples return, its options say."""
+"""The learner `diffusion`: its loss, samples and options."""
 
 import dataclasses
 
@@ -60,7 +60,7 @@ def test_at_temperature_zero_no_sample_depends_on_its_key(learned):
 
 
 def test_a_sample_starts_as_the_settings_say():
-    """A network that predicts no noise leaves what a sample starts from, scaled."""
+    """A network that predicts no noise leaves the sample's initial noise, scaled."""
     settings = tiny(diffusion_steps=50, ddim_steps=5, temperature=0.25)
     model = repeats.model(settings)
     shapes = jax.eval_shape(model.init, jax.random.key(0))

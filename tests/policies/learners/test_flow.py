@@ -1,4 +1,4 @@
-"""The learner `flow`: exact where its velocity is known, and what its samples return."""
+"""The learner `flow`: exact for a known velocity, and its samples."""
 
 import fakes
 import jax
@@ -10,7 +10,7 @@ import repeats
 from starjax.core import config
 from starjax.policies.models import flow
 
-MEAN, SPREAD = 0.3, 0.2  # of a normal distribution
+MEAN, SPREAD = 0.3, 0.2  # quantile of a normal distribution
 FAR = 1e9 * np.array([-1.0, 1.0])
 
 

@@ -46,7 +46,7 @@ def test_conv_is_jaxs_convolution(kernel, stride, length):
     ],
 )
 def test_dropped_taps_change_nothing(kernel, stride, length, live):
-    """The full kernel gives the same function whatever its dead taps are."""
+    """The full kernel gives the same function for any dead taps."""
     x = inputs(2, length, 6)
     params, y = run(layers.Conv1d(4, kernel, stride=stride), x)
     assert params["kernel"].shape[0] == live.stop - live.start

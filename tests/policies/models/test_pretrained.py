@@ -1,4 +1,4 @@
-"""ImageNet weights for the ResNet-18: every convolution, under whatever prefix a file has."""
+"""ImageNet weights for the ResNet-18: every convolution, under any prefix of a file."""
 
 import pickle
 

@@ -75,7 +75,7 @@ def test_size_of_the_papers_network():
 
 
 def test_it_is_a_residual_mlp_with_gelu(trained):
-    """In numpy, as its docstring says; the trained one, as an untrained one says 0."""
+    """In numpy, by its docstring; trained, because an untrained one returns 0."""
     params, (x, trocar, history) = trained[0]["params"], inputs()
 
     def gelu(x):

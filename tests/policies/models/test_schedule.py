@@ -9,7 +9,7 @@ from starjax.policies.models import schedule
 
 
 def alpha_bar_closed_form(k: int, steps: int) -> float:
-    """cos^2 at (k + 1) / K over cos^2 at 0: what the product of (1 - beta) telescopes to."""
+    """cos^2 at (k + 1) / K over cos^2 at 0, to which the product of (1 - beta) telescopes."""
     cosine = math.cos(((k + 1) / steps + 0.008) / 1.008 * math.pi / 2) ** 2
     return cosine / math.cos(0.008 / 1.008 * math.pi / 2) ** 2
 

@@ -75,7 +75,7 @@ def test_size_is_the_published_one_less_the_dead_taps():
 
 @pytest.fixture(scope="module")
 def gradients(params):
-    """Of the last step's output, by parameters, sequence and condition of the first sample."""
+    """Derivatives of the last output, by parameters, sequence and condition of the first sample."""
     x, k, cond = data()
     output = lambda p, x, c: make().apply(p, x, k, c)[0, -1].sum()  # noqa: E731
     return jax.jit(jax.grad(output, (0, 1, 2)))(params, x, cond)

@@ -1,1 +1,1 @@
-"""A task and an arm from outside of starjax: what somebody else would write."""
+"""A task and an arm from outside of starjax, as in another package."""

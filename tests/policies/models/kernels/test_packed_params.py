@@ -1,4 +1,4 @@
-"""Packed parameters, unpacked, are what they were."""
+"""Packed parameters, unpacked, are unchanged."""
 
 import chex
 import jax

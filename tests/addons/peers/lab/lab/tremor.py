@@ -1,4 +1,4 @@
-"""A disturbance: the hand trembles, so commands are carried out somewhere beside them."""
+"""A disturbance: the hand trembles, so commands are executed with an offset."""
 
 import jax
 
