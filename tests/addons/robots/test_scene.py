@@ -1,6 +1,5 @@
 """Scenes with contact behind topics: one control period, and tasks done by packaged policies."""
 
-import os
 import re
 import subprocess
 import sys
@@ -11,9 +10,10 @@ import pytest
 
 pytest.importorskip("cyclonedds")
 
+from loopback import DOMAIN
+
 from starjax.addons.robots import bus, robot_file, scene_body, sim_arm, sim_robot
 
-DOMAIN = 100 - int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:])
 # Arm, instrument, task, policy and camera, as in the policies' training.
 TASKS = [
     ("fr5", "grasper", "peg_transfer", "compact", "camera"),
