@@ -142,7 +142,7 @@ def made(own_bus, file, is_dry=False):
     options |= {"limits": limits, "tolerances": node.tolerances(file, is_dry)}
     with deploy.Client("", file.p_world_trocar, **options) as client:
         one = arm.CrtkArm(own_bus, file, 32)
-        yield one, client, topic_table.look(one, 0.3, 20.0, lambda: False)
+        yield one, client, topic_table.look(one, 0.3, 60.0, lambda: False)
 
 
 def later(process, line, after=15):
