@@ -66,7 +66,7 @@ def test_a_simulators_time_stands_then_goes_on(monkeypatch):
     assert own.now() == pytest.approx(3.0, abs=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize(("arm", "instrument", "task", "policy", "camera"), TASKS)
 def test_a_packaged_policy_does_its_task_over_topics(
     tmp_path, arm, instrument, task, policy, camera
