@@ -20,7 +20,6 @@ import claims
 import tables
 from PIL import Image, PngImagePlugin
 
-from starjax.evaluation import disturbances
 from starjax.report import stats, style
 
 RESULTS = Path(__file__).resolve().parents[1] / "benchmarks" / "results"
@@ -58,7 +57,7 @@ def levels(files: Sequence[str], labels: Sequence[str]) -> Scores:
     for file, label in zip(files, labels, strict=True):
         found = json.loads((RESULTS / f"{file}.json").read_text())["disturbances"]
         for name, one in found.items():
-            row = scores.setdefault(disturbances.RENAMED.get(name) or name, {})
+            row = scores.setdefault(name, {})
             for level, result in one["levels"].items():
                 counts = result["strict"]["successes"], result["strict"]["trials"]
                 row[f"{label} {level}"] = stats.rate(*counts)

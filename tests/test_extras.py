@@ -27,7 +27,8 @@ def bare(program: str) -> subprocess.CompletedProcess:
 
 
 def test_rcm_needs_no_extra():
-    done = bare("from starjax import rcm; from starjax.core import types; print(rcm.TROCARS.radius.shape)")
+    modules = "from starjax import rcm\nfrom starjax.core import types\n"
+    done = bare(f"{modules}print(rcm.TROCARS.radius.shape)")
     assert done.stdout == "(12,)\n", done.stderr
 
 

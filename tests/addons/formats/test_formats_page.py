@@ -5,7 +5,7 @@ import pathlib
 from starjax.addons.formats import base
 
 PAGE = pathlib.Path(__file__).parents[3] / "docs" / "use" / "formats.md"
-HEADER = "| format | for | read | written"
+HEADER = "| format | read | written | byte-exact round trip |"
 
 
 def rows():
@@ -21,6 +21,7 @@ def rows():
 def test_each_format_has_a_row_that_says_if_it_is_written():
     table = {name.strip("`"): cells for name, *cells in rows()}
     assert table.keys() == set(base.FORMATS.built_in)
-    for name, (purpose, read, written) in table.items():
-        assert (written != "no") == (base.FORMATS.get(name).write is not None), name
-        assert purpose and read, name
+    for name, (read, written, exact, caught) in table.items():
+        is_written = base.FORMATS.get(name).write is not None
+        assert (written != "no") == is_written == (exact != "–"), name
+        assert read and caught, name
