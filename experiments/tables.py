@@ -1,4 +1,4 @@
-"""Draws the tables of README.md, docs/ and benchmarks/ and the pages of results, from results.
+"""Draws tables of README.md, docs/ and benchmarks/, pages of results and model cards, from results.
 
     python experiments/tables.py            writes them
     python experiments/tables.py --check    fails if a page differs from the one drawn
@@ -25,6 +25,9 @@ import leaderboard_page  # noqa: E402
 import levels  # noqa: E402
 import newest  # noqa: E402
 import preset_table  # noqa: E402
+
+from starjax.cli import model_card  # noqa: E402
+from starjax.policies import packaged, policy_file  # noqa: E402
 
 FINETUNED = {
     "finetune_ways": finetuned.ways,
@@ -76,6 +79,9 @@ def pages() -> Iterator[tuple[Path, str]]:
     marked = [ROOT / "README.md", ROOT / "benchmarks" / "README.md", HERE / "README.md"]
     for page in [*marked, *sorted((ROOT / "docs").rglob("*.md"))]:
         yield page, redraw(page.read_text(), table)
+    for file in sorted((packaged.CHECKOUT / packaged.PACKAGE).glob("*.safetensors")):
+        result = model_card.find_result(file)
+        yield file.with_suffix(".md"), model_card.text(file.stem, policy_file.load(file), result)
 
 
 def main() -> int:

@@ -1,6 +1,8 @@
 """`starjax pack`: its file, its output, and mistakes in one line."""
 
 import dataclasses
+import json
+import re
 
 import fakes
 import jax
@@ -8,11 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import safetensors.numpy
+import yaml
 
 from starjax.cli import pack
 from starjax.core import config, errors
 from starjax.data import normalizer
-from starjax.policies import policy_file
+from starjax.policies import packaged, policy_file
 from starjax.policies.monitor import record, scores
 
 POLICY = config.with_options(dataclasses.replace(fakes.TINY, dtype="bfloat16"), temperature=0.5)
@@ -57,6 +60,21 @@ def test_a_packed_policy_is_small_and_for_a_cpu(made, tmp_path, capsys, argv, te
         f"temperature {temperature:g}",
     ):
         assert words in said
+
+
+def test_a_card_has_the_trials_of_the_result_beside_the_policy(made, tmp_path):
+    assert pack.main(["mine.safetensors", "plain.safetensors"]) == 0
+    assert "None recorded" in (tmp_path / "plain.md").read_text()
+    found = json.loads(packaged.find("name", "compact").with_suffix(".json").read_text())
+    (tmp_path / "result.json").write_text(json.dumps(found | {"commit": "c0ffee"}))
+    assert pack.main(["mine.safetensors", "mine2.safetensors"]) == 0
+    card = (tmp_path / "mine2.md").read_text()
+    header = yaml.safe_load(card.split("---")[1])
+    assert header["license"] == "apache-2.0" and made.scene.task in header["tags"]
+    rows = re.findall(r"\| (\d+)/(\d+) \|", card)
+    assert [int(n) for _, n in rows] == [800, 400] + [100] * 12
+    assert sum(int(n) for n, _ in rows[2:]) == found["strict"]["all"]["successes"]
+    assert "c0ffee" in card and found["command"] in card
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from starjax.runtime import files, jax_start, xla
 DESCRIPTION = """Writes a policy for inference: weights in float16, arithmetic in float32.
 
 POLICY is a policy.safetensors, OUT the new file. Weights are rounded to 11 bits: evaluate OUT
-itself (`starjax evaluate --policy OUT`).
+itself (`starjax evaluate --policy OUT`). OUT.md is its model card, from the result beside POLICY.
 
 Examples:
   starjax pack runs/cpu/stardiff/policy.safetensors half.safetensors"""
@@ -46,6 +46,7 @@ def main(argv: Sequence[str]) -> int:
 
     import jax
 
+    from starjax.cli import model_card
     from starjax.policies import policy_file
 
     try:
@@ -64,6 +65,8 @@ def main(argv: Sequence[str]) -> int:
         policy_file.save(out, trained._replace(policy=policy), half=True)
     except ValueError as error:
         raise errors.UsageError("POLICY", "weights that fit float16", error) from error
+    card = model_card.text(out.stem, trained, model_card.find_result(source))
+    files.write_bytes(out.with_suffix(".md"), card.encode())
     count = sum(leaf.size for leaf in jax.tree.leaves(trained.params)) / 1e6
     before, after = (files.size(path.stat().st_size) for path in (source, out))
     print(f"{out}: {count:.3g} M parameters, {after} ({source}: {before})")
