@@ -62,7 +62,7 @@ def test_a_packed_policy_is_small_and_for_a_cpu(made, tmp_path, capsys, argv, te
         assert words in said
 
 
-def test_a_card_has_the_trials_of_the_result_beside_the_policy(made, tmp_path):
+def test_a_card_has_the_trials_of_the_result(made, tmp_path):
     assert pack.main(["mine.safetensors", "plain.safetensors"]) == 0
     assert "None recorded" in (tmp_path / "plain.md").read_text()
     found = json.loads(packaged.find("name", "compact").with_suffix(".json").read_text())

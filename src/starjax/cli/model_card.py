@@ -19,7 +19,7 @@ LIMITS = """\
 
 
 def find_result(policy: Path) -> dict[str, Any]:
-    """Returns the result beside a policy's file, of its run or package; empty without one."""
+    """Returns the result in the folder of a policy, of its run or package; empty without one."""
     for file in (policy.with_suffix(".json"), policy.with_name("result.json")):
         if file.is_file():
             return json.loads(file.read_text())

@@ -16,7 +16,8 @@ from starjax.runtime import files, jax_start, xla
 DESCRIPTION = """Writes a policy for inference: weights in float16, arithmetic in float32.
 
 POLICY is a policy.safetensors, OUT the new file. Weights are rounded to 11 bits: evaluate OUT
-itself (`starjax evaluate --policy OUT`). OUT.md is its model card, from the result beside POLICY.
+itself (`starjax evaluate --policy OUT`). OUT.md is its model card, with the result in the folder
+of POLICY.
 
 Examples:
   starjax pack runs/cpu/stardiff/policy.safetensors half.safetensors"""
