@@ -250,7 +250,7 @@ FACTS = {
     "groups": groups,
     "streams": streams,
 }
-NUMBERS = {"losses": losses}  # steps and trials follow
+NUMBERS = {"losses": losses, "steps": steps}  # trials follow
 
 
 def golden(part: str) -> Any:
@@ -266,8 +266,13 @@ def test_names_and_identities_are_what_they_were(part):
     assert now == frozen
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("part", NUMBERS)
+@pytest.mark.parametrize(
+    "part",
+    [
+        pytest.param("losses", marks=pytest.mark.slow),
+        pytest.param("steps", marks=pytest.mark.release),
+    ],
+)
 def test_numbers_are_what_they_were(part, monkeypatch):
     frozen = golden(part)
     optimized = jax.config.read("jax_disable_most_optimizations")
