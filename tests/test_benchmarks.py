@@ -10,7 +10,7 @@ from starjax.policies.models.kernels import packed_params
 from starjax.runtime import provenance
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_training_step_is_timed(monkeypatch, capsys, pytestconfig):
     monkeypatch.setattr(packed_params, "PLATFORMS", {"cpu"})
     monkeypatch.syspath_prepend(pytestconfig.rootpath / "benchmarks")

@@ -30,6 +30,7 @@ EXPERTS = {  # control steps
 }
 # The script with two arms has no second try, and drops a block now and then.
 DROPS = {"peg_transfer_bimanual": 1}
+LONG = {"needle_regrasp", "suture_throw"}  # needle_drive stands for them in each run
 # A pad that lies across the arc touches more of its segments than are kept, the nearest.
 CROWDED = {"needle_pick", "needle_handover", "needle_regrasp"}
 LOOKS = 10  # control steps between two looks at all contacts
@@ -70,7 +71,10 @@ def said_by_parts(task, limit):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", EXPERTS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[pytest.mark.release] if n in LONG else []) for n in EXPERTS],
+)
 def test_the_expert_of_a_task_succeeds(name):
     environment = envs.make(name, observation="state")
     task, agent = environment.task, environment.task.expert()
