@@ -1,7 +1,5 @@
 """Settings and fixtures of every test: XLA is set up here, before anything imports jax."""
 
-import gc
-import mmap
 import os
 import pathlib
 import types
@@ -22,9 +20,6 @@ from starjax.runtime import stored  # noqa: E402
 stored.is_used = False  # no key sees the functions that tests replace in modules
 
 HERE = pathlib.Path(__file__).parent
-# Bytes of a worker from which on it forgets its compiled programs after a file: two workers and the
-# processes that they start fit a machine of 16 GB.
-MEMORY = 2.5e9
 # Where numbers are compared to the last bit, or settings of jax are recorded. Elsewhere most
 # programs run once, and compiling them takes longer than running them.
 OPTIMIZED = {"data", "evaluation", "report", "rollouts", "runtime"}
@@ -36,16 +31,6 @@ STARTERS = {"pty", "several", "subprocess", "survive"}
 def pytest_runtest_setup(item: pytest.Item) -> None:
     is_quick = item.path.relative_to(HERE).parts[0] not in OPTIMIZED
     jax.config.update("jax_disable_most_optimizations", is_quick)
-
-
-def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
-    if nextitem is None or nextitem.path == item.path:
-        return
-    statm = pathlib.Path("/proc/self/statm")  # Linux only
-    pages = int(statm.read_text().split()[1]) if statm.exists() else 0
-    if pages * mmap.PAGESIZE > MEMORY:
-        jax.clear_caches()
-        gc.collect()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
