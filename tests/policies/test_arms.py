@@ -98,17 +98,11 @@ def test_one_roll_network_serves_every_arm(dataset):
     params = jax.tree.map(lambda x: x + 0.01, fakes.params(policy))
     batch = windows.gather(dataset, jnp.array([3, 25, 70]), 2, 16)
     given = jit(policy.prepare)(stats, jax.random.key(0), batch)
-    swapped = given._replace(
-        p=given.p[:, :, ::-1],
-        trocar=given.trocar[:, ::-1],
-        history=given.history[:, :, ::-1],
-        roll=given.roll[:, :, ::-1],
-    )
+    lesson = jax.tree.map(lambda x: x[:, :, ::-1], given.lesson)
+    swapped = given._replace(trocar=given.trocar[:, ::-1], lesson=lesson)
+    other = swapped._replace(lesson=lesson._replace(target=given.lesson.target))
     loss = jit(policy.loss)
-    here, there, wrong = (
-        float(loss(params, x)[1]["roll_loss"])
-        for x in (given, swapped, swapped._replace(roll=given.roll))
-    )
+    here, there, wrong = (float(loss(params, x)[1]["roll_loss"]) for x in (given, swapped, other))
     assert here == pytest.approx(there, rel=1e-5) and abs(here - wrong) > 1e-4
 
 
