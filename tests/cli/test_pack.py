@@ -71,7 +71,7 @@ def test_a_card_has_the_trials_of_the_result(made, tmp_path):
     card = (tmp_path / "mine2.md").read_text()
     header = yaml.safe_load(card.split("---")[1])
     assert header["license"] == "apache-2.0" and made.scene.task in header["tags"]
-    rows = re.findall(r"\| (\d+)/(\d+) \|", card)
+    rows = re.findall(r"\((\d+)/(\d+)\)", card)
     assert [int(n) for _, n in rows] == [800, 400] + [100] * 12
     assert sum(int(n) for n, _ in rows[2:]) == found["strict"]["all"]["successes"]
     assert "c0ffee" in card and found["command"] in card

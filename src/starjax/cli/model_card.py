@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from starjax.policies.policy_file import Trained
+from starjax.report import formats, stats
 
 LIMITS = """\
 - Trained and evaluated in simulation, on demonstrations of a scripted expert. Not for use on a
@@ -46,13 +47,13 @@ def text(name: str, trained: Trained, result: Mapping[str, Any]) -> str:
         "method, learner": f"`{trained.method}`, `{policy.learner}`",
         "demonstrations": "unknown" if demos is None else _demonstrations(demos),
         "training": f"{trained.train.steps:,} steps of {trained.train.batch_size}",
-        "dataset": result.get("dataset_digest") or "not recorded",
+        "dataset": result.get("dataset_digest", ""),
     }
     return "\n".join(
         [
             *("---", *header, *(f"- {tag}" for tag in tags), "---", ""),
             *(f"# {name}", "", "A policy of starjax: `starjax evaluate --policy PATH`.", ""),
-            *("| | |", "|---|---|", *(f"| {key} | {value} |" for key, value in rows.items()), ""),
+            *(_facts(rows), ""),
             *("## Evaluation", "", *(_evaluation(result) if result else ["None recorded."]), ""),
             *("## Limits", "", LIMITS, ""),
         ]
@@ -68,42 +69,41 @@ def _demonstrations(demos: Any) -> str:
     return f"{demos.per_trocar} at each of {demos.seen_trocars} seen trocars{expert}"
 
 
+def _facts(rows: Mapping[str, str]) -> str:
+    table = [["", ""], *([name, value or "not recorded"] for name, value in rows.items())]
+    return formats.render(table, names=2)
+
+
 def _evaluation(result: Mapping[str, Any]) -> list[str]:
-    rates = {
-        "seen trocars": result["strict"]["seen"],
-        "unseen trocars": result["strict"]["unseen"],
-        **{_trocar(row): row for row in result["per_trocar"]},
+    scores = {
+        "all seen": result["strict"]["seen"],
+        "all unseen": result["strict"]["unseen"],
+        **{
+            f"{row['trocar']}, {'seen' if row['seen'] else 'unseen'}": row
+            for row in result["per_trocar"]
+        },
     }
-    provenance = {
+    table = [
+        [name, formats.rate(stats.rate(score["successes"], score["trials"]))]
+        for name, score in scores.items()
+        if score["trials"]
+    ]
+    executed = result["rcm_error_mm"]["executed"]
+    rows = {
+        "RCM error executed": f"mean {formats.millimetres(executed['mean'])} mm, 99th percentile "
+        f"{formats.millimetres(executed['p99'])} mm",
+        "time of a decision": f"{result['inference_ms']['p50']:.1f} ms, median",
         "command": f"`{result['command']}`",
-        "seeds of training, trials": f"{result['config'].get('seed', 'not recorded')}, "
-        f"{result.get('seed', 'not recorded')}",
-        "commit": result.get("commit") or "not recorded",
-        "versions": ", ".join(f"{k} {v}" for k, v in result["versions"].items() if "jax" in k),
-        "device": ", ".join(result["hardware"]["devices"]),
+        "seed of the training": formats.listing(result["config"].get("seed")),
+        "seed of the trials": formats.listing(result.get("seed")),
+        "commit": formats.code(result.get("commit"), result.get("dirty")),
+        "versions": formats.listing(result["versions"]),
+        "machine": formats.hardware(result["hardware"]),
     }
     return [
-        "Strict success, with 95% Wilson intervals.",
+        "Strict success in percent, with 95% Wilson intervals.",
         "",
-        "| Trials at | successes | rate |",
-        "|---|---:|---:|",
-        *(f"| {name} | {row['successes']}/{row['trials']} | {_rate(row)} |"
-          for name, row in rates.items() if row["trials"]),
+        formats.render([["Trocar", "Success"], *table], names=1),
         "",
-        f"RCM error executed: mean {result['rcm_error_mm']['executed']['mean']:.3f} mm, "
-        f"99th percentile {result['rcm_error_mm']['executed']['p99']:.3f} mm. "
-        f"A decision takes {result['inference_ms']['p50']:.1f} ms (median).",
-        "",
-        "| | |",
-        "|---|---|",
-        *(f"| {key} | {value} |" for key, value in provenance.items()),
-    ]  # fmt: skip
-
-
-def _trocar(row: Mapping[str, Any]) -> str:
-    return f"trocar {row['trocar']}, {'seen' if row['seen'] else 'unseen'}"
-
-
-def _rate(row: Mapping[str, Any]) -> str:
-    low, high = row["ci95"]
-    return f"{100 * row['rate']:.1f}% ({100 * low:.1f}–{100 * high:.1f})"
+        _facts(rows),
+    ]
