@@ -1,10 +1,9 @@
 """One control step of a rollout as the page shows it, simulated or recorded."""
 
-import functools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -70,9 +69,8 @@ def rcm_error_mm(frame: Frame) -> float:
 
 def colours(names: SceneNames, model: mujoco.MjModel, labels: Mapping[str, int]) -> np.ndarray:
     """Returns the colours `[G, 3]` of a scene, the goal of an episode marked."""
-    task = registries.tasks.get(names.task)
-    mark = jax.jit(functools.partial(scene.marked, task, task.bind(model)))
-    return np.asarray(mark(labels, geometry.geom_rgb(model)))
+    task, rgb = registries.tasks.get(names.task), jnp.asarray(geometry.geom_rgb(model))
+    return np.asarray(scene.marked(task, task.bind(model), labels, rgb))
 
 
 def from_arrays(
