@@ -4,6 +4,7 @@ import contextlib
 import importlib.util
 import io
 import itertools
+import json
 import re
 import shlex
 import tomllib
@@ -148,6 +149,12 @@ def test_links_lead_somewhere(page):
     """Links work in a checkout; the site's builder rewrites those that leave docs/."""
     for target in LINK.findall(FENCE.sub("", page.read_text())):
         assert "://" in target or (page.parent / target).exists(), target
+
+
+def test_groups_of_entry_points_exist(page, root):
+    groups = json.loads((root / "tests/golden/identity/groups.json").read_text())
+    named = r"(?:group |entry-points\.)[`\"](starjax\.\w+)"
+    assert set(re.findall(named, page.read_text())) <= set(groups)
 
 
 def test_included_files_are_as_they_are(page, root):
