@@ -48,7 +48,7 @@ ROW = methods.METHODS["dp_rcm4"]
     ],
 )
 def test_methods(monkeypatch, row, expected):
-    monkeypatch.setitem(methods._BUILT_IN, "mine", row)
+    monkeypatch.setitem(methods.METHODS.registry.built_in, "mine", row)
     assert faults(method_checks.check("mine", 1)) == expected
 
 
