@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 
 from starjax import rcm, testing
-from starjax.addons.formats import base as formats
-from starjax.addons.formats import part_check as format_check
 from starjax.core.learners import Learner
 from starjax.evaluation.disturbances import DISTURBANCES
 from starjax.evaluation.expert import ExpertEpisodes
@@ -273,50 +271,6 @@ def test_policies(fault):
     wrong = found("policy", ExternalPolicy("holds", "reach", make, observation="state"))
     assert list(wrong) == [POLICIES[fault]] * bool(fault), wrong
     assert fault != "wxyz" or "wxyz" in wrong["command"]
-
-
-# Formats.
-
-
-def format_of(fault, tmp_path):
-    zarr = formats.FORMATS.get("zarr")
-
-    def write(path, source, video):
-        def read(episode, names):
-            arrays = source.read(1 - episode if fault == "episodes" else episode, names)
-            if fault == "nan":
-                arrays = {n: np.nan_to_num(x) for n, x in arrays.items()}
-            if fault == "integers":
-                arrays = {n: np.round(x).astype(x.dtype) for n, x in arrays.items()}
-            return arrays
-
-        columns = dict(source.columns)
-        if fault == "names":
-            columns = {n: c._replace(names=()) for n, c in columns.items()}
-        if fault == "order":
-            columns = {n: c._replace(names=c.names[::-1]) for n, c in columns.items()}
-        lengths = source.lengths[::-1] if fault == "episodes" else source.lengths
-        origin = None if fault == "origin" else source.origin
-        changed = source._replace(read=read, columns=columns, lengths=lengths, origin=origin)
-        zarr.write(path, changed, video)
-        path.joinpath("of_mine").touch()
-
-    own = lambda path: (path / "of_mine").exists()  # noqa: E731
-    if fault == "any folder":
-        own = lambda path: True  # noqa: E731
-    return zarr._replace(write=write, recognises=own)
-
-
-@pytest.mark.parametrize(
-    "fault", ["", "names", "order", "nan", "integers", "episodes", "origin", "any folder"]
-)
-def test_formats(monkeypatch, tmp_path, fault):
-    mine = format_of(fault, tmp_path)
-    # In front of the format that it writes by, which takes the same folder.
-    rows = {"mine": mine, **formats.FORMATS.built_in}
-    monkeypatch.setattr(format_check, "FORMATS", formats.FORMATS._replace(built_in=rows))
-    monkeypatch.setattr(formats, "FORMATS", formats.FORMATS._replace(built_in=rows))
-    assert bool(faults(format_check.check("mine", 1))) == bool(fault)
 
 
 # Disturbances.

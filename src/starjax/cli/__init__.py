@@ -204,7 +204,7 @@ def _groups() -> dict[str, Mapping[str, Subcommand]]:
     return {"": CORE, **{title: rows for title, rows in (added | packages).items() if rows}}
 
 
-def _raise_interrupts(ignored: Any) -> None:
+def _raise_interrupts(ignored: "sys.UnraisableHookArgs") -> None:
     """Prints an exception that Python dropped; a stop among them is raised again."""
     if ignored.exc_type is not KeyboardInterrupt:
         sys.__unraisablehook__(ignored)

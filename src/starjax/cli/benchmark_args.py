@@ -48,7 +48,7 @@ def with_trials(args: ArgsT, command: str, task: str) -> ArgsT:
     return dataclasses.replace(args, eval=dataclasses.replace(trials, seed=protocol.SEED))  # type: ignore
 
 
-def _seed(args: Any) -> str:
+def _seed(args: BenchmarkArgs) -> str:
     """Returns the field with the seed of the trials; that of a run may be its training's alone."""
     return "eval.seed" if hasattr(args.eval, "seed") else "seed"
 
@@ -58,7 +58,7 @@ def label() -> str:
     return f"benchmark{protocol.VERSION}"
 
 
-def _of(args: Any, field: str) -> Any:
+def _of(args: BenchmarkArgs, field: str) -> Any:
     for name in field.split("."):
         args = getattr(args, name)
     return args

@@ -154,7 +154,7 @@ def randomised(
     return base.with_random_levels(env, max_levels), recorded, parts
 
 
-def _changes_demos(kind: Any) -> bool:
+def _changes_demos(kind: base.Disturbance) -> bool:
     """Returns True if recorded motions differ by it in a way that a policy can learn from."""
     return kind.for_demos and kind.is_of_motion
 

@@ -21,6 +21,7 @@ from starjax.core import config_json, errors, extras, methods
 from starjax.runtime import files
 
 if TYPE_CHECKING:  # for annotations alone
+    from starjax.evaluation import result as result_file
     from starjax.policies.in_env import PolicyInEnv
 
 DESCRIPTION = """Scores a trained policy on its task's trocars and records a video.
@@ -166,7 +167,7 @@ def _refuse_foreign(folder: Path, has_same_weights: bool) -> None:
         )
 
 
-def _times(result: Any) -> str:
+def _times(result: "result_file.Result") -> str:
     """Returns a line with the durations of a successful trial and of an inference."""
     steps = result.figures["steps"]["median"]
     success = "-" if steps is None else f"{steps / result.control_hz:.1f} s"

@@ -4,10 +4,11 @@ The header is YAML that model hubs read.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from starjax.core import config
 from starjax.policies.policy_file import Trained
 from starjax.report import formats, stats
 
@@ -60,11 +61,11 @@ def text(name: str, trained: Trained, result: Mapping[str, Any]) -> str:
     )
 
 
-def _listed(names: Any) -> str:
+def _listed(names: Sequence[str]) -> str:
     return ", ".join(f"`{name}`" for name in names) or "none"
 
 
-def _demonstrations(demos: Any) -> str:
+def _demonstrations(demos: config.DemosConfig) -> str:
     expert = f", expert `{demos.expert}`" if demos.expert else ""
     return f"{demos.per_trocar} at each of {demos.seen_trocars} seen trocars{expert}"
 

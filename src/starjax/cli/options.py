@@ -13,7 +13,7 @@ import shlex
 import sys
 import typing
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import tyro
 from tyro import _errors as tyro_errors  # private: see _refuse
@@ -22,7 +22,13 @@ from starjax.cli import help_pages
 from starjax.core import config as config_lib
 from starjax.core import errors, limits
 
-SettingsT = TypeVar("SettingsT")
+if TYPE_CHECKING:  # for annotations alone
+    from _typeshed import DataclassInstance
+
+SettingsT = TypeVar("SettingsT", bound="DataclassInstance")
+StructInfo = tyro.constructors.StructTypeInfo
+StructSpec = tyro.constructors.StructConstructorSpec
+StructRule = Callable[[StructInfo], StructSpec | None]
 
 AUTO = "auto"  # default of flags whose help explains it
 # The words before the flags, as help names them.
@@ -101,7 +107,7 @@ def parse(
     return parsed
 
 
-def registry(*rules: Any) -> tyro.constructors.ConstructorRegistry:
+def registry(*rules: StructRule) -> tyro.constructors.ConstructorRegistry:
     """Makes a registry of tyro with rules for dataclasses; later rules take precedence."""
     made = tyro.constructors.ConstructorRegistry()
     for rule in rules:
@@ -112,7 +118,7 @@ def registry(*rules: Any) -> tyro.constructors.ConstructorRegistry:
 def _help(cli: Callable[..., Any], kind: str, name: str, description: str) -> str:
     """Returns the help page of a command, the short or the full one."""
 
-    def flags(*rules: Any) -> str:
+    def flags(*rules: StructRule) -> str:
         # tyro breaks a description anywhere in a word, so the page has its own.
         shown = io.TextIOWrapper(io.BytesIO(), getattr(sys.stdout, "encoding", None) or "utf-8")
         with contextlib.redirect_stdout(shown), contextlib.suppress(SystemExit):
@@ -143,7 +149,7 @@ def typed_value(field: str, argv: Sequence[str]) -> str | None:
     return value
 
 
-def flags(settings: Any) -> list[str]:
+def flags(settings: "DataclassInstance | type[DataclassInstance]") -> list[str]:
     """Returns all flags of a (nested) dataclass, such as `--train.steps`, and `no-` flags."""
     names = []
     for name, _, hint in limits.fields(settings):
@@ -181,7 +187,7 @@ def _expanded(word: str) -> str:
     return f"{name}{equals}{os.path.expanduser(value)}"
 
 
-def _refuse(settings: Any, event: Any) -> NoReturn:
+def _refuse(settings: "DataclassInstance | type[DataclassInstance]", event: Any) -> NoReturn:
     """Raises UsageError in place of an error of tyro.
 
     tyro prints a box of five lines, and its public interface hands out neither the argument nor the
@@ -212,12 +218,10 @@ def _name(argument: Any) -> str:
     return argument.lowered.name_or_flags[-1] if argument else "FLAG"
 
 
-StructInfo = tyro.constructors.StructTypeInfo
-StructSpec = tyro.constructors.StructConstructorSpec
 _busy: list[tuple[Any, type]] = []  # rules at work, and the dataclasses whose fields they list
 
 
-def others(rule: Any, info: StructInfo) -> StructSpec | None:
+def others(rule: StructRule, info: StructInfo) -> StructSpec | None:
     """Returns the fields of a dataclass by the rules before `rule`; None for other types."""
     is_settings = isinstance(info.type, type) and dataclasses.is_dataclass(info.type)
     if not is_settings or (rule, info.type) in _busy:

@@ -45,7 +45,7 @@ def _read(folder: Path, weights: str) -> Any:
     return scored if scored.trials and scored.weights == weights else None
 
 
-def _is_of(scored: Any, config: config_lib.RunConfig) -> bool:
+def _is_of(scored: result.Result, config: config_lib.RunConfig) -> bool:
     """Returns True if a result has these settings."""
     try:
         before = config_json.from_dict(config_lib.RunConfig, scored.config)

@@ -5,13 +5,16 @@ import ipaddress
 import os
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 from starjax.cli import checks, options
 from starjax.core import errors
 from starjax.core.limits import Count, Positive, Range
 from starjax.policies import packaged
 from starjax.runtime import jax_start, signals, xla
+
+if TYPE_CHECKING:  # for annotations alone
+    from starjax.deploy import server
 
 KEY = checks.API_KEY
 DESCRIPTION = f"""Serves a policy over websockets: observations in, commands out.
@@ -79,7 +82,7 @@ def main(argv: Sequence[str]) -> int:
     raise KeyboardInterrupt(_summary(counts))
 
 
-def _summary(counts: Any) -> str:
+def _summary(counts: "server.Counts") -> str:
     return (
         f"stopped; {counts.answered} requests of {counts.clients} clients answered in "
         f"{counts.calls} calls, {counts.refused} refused"

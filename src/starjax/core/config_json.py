@@ -7,13 +7,16 @@ import dataclasses
 import json
 import typing
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
 
 from starjax.core.config import PolicyConfig, RunConfig
 from starjax.core.learners import LEARNERS
 from starjax.core.limits import INLINE
+
+if TYPE_CHECKING:  # for annotations alone
+    from _typeshed import DataclassInstance
 
 SettingsT = TypeVar("SettingsT")
 
@@ -45,7 +48,7 @@ def differing_settings(configs: Sequence[Mapping[str, Any]]) -> list[str]:
     ]
 
 
-def as_json(settings: Any) -> dict[str, Any]:
+def as_json(settings: "DataclassInstance") -> dict[str, Any]:
     """Returns settings as JSON values: dicts, and lists for tuples."""
     return json.loads(json.dumps(_plain(settings)))
 

@@ -8,9 +8,12 @@ import math
 import operator
 import typing
 from collections.abc import Iterator
-from typing import Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from starjax.core import errors
+
+if TYPE_CHECKING:  # for annotations alone
+    from _typeshed import DataclassInstance
 
 MOST = 2**31 - 1  # whole numbers of compiled programs have 32 bits
 # Metadata of a field that holds settings whose names stand among those of the dataclass itself.
@@ -68,7 +71,9 @@ class Setting(NamedTuple):
     hint: Any
 
 
-def fields(settings: Any, prefix: str = "", path: str = "") -> Iterator[Setting]:
+def fields(
+    settings: "DataclassInstance | type[DataclassInstance]", prefix: str = "", path: str = ""
+) -> Iterator[Setting]:
     """Yields the settings of a dataclass, or of an instance with the types of its parts."""
     kind = settings if isinstance(settings, type) else type(settings)
     hints = typing.get_type_hints(kind, include_extras=True)
@@ -90,7 +95,7 @@ def within(hint: Any) -> Range | None:
     return found[-1] if found else None
 
 
-def check(settings: Any) -> None:
+def check(settings: "DataclassInstance") -> None:
     """Raises UsageError for the first field out of its range; None is always valid."""
     for name, path, hint in fields(settings):
         value, limit = operator.attrgetter(path)(settings), within(hint)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from starjax.core import errors
+from starjax.core.registry import Registry
 
 ACCEPTED = Path(__file__).with_name("accepted.json")
 _OURS = "starjax"
@@ -42,7 +43,7 @@ class Identity(NamedTuple):
     code: str | Callable
 
 
-def identity(registry: Any, name: str) -> Identity:
+def identity(registry: Registry, name: str) -> Identity:
     """Returns the identity of a part of a `registry.Registry`; records without a version have 1."""
     path = registry.path(name)
     version = getattr(path and registry.get(name), "version", 1)

@@ -1,13 +1,18 @@
-"""The structs that every layer shares. Imports jax only.
+"""The structs that every layer shares. Imports jax and numpy only.
 
 Shape letter A: arms. It is the last leading axis wherever arrays have one shape for all arms; a
 task of one arm has A = 1.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import jax
+import numpy as np
+
+Array = jax.Array | np.ndarray
+ArrayTree: TypeAlias = Array | Iterable["ArrayTree"] | Mapping[Any, "ArrayTree"]
+Tree = TypeVar("Tree")  # a pytree that a function maps leaf by leaf
 
 
 class Pose(NamedTuple):

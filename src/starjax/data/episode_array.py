@@ -76,7 +76,7 @@ class EpisodeArray:
 
         self._opened = opened
 
-    def __getitem__(self, index: Any) -> np.ndarray:
+    def __getitem__(self, index: np.ndarray) -> np.ndarray:
         """Returns the frames at `index` `[N]` as `[N, ...]` in memory."""
         index = np.asarray(index)
         out = np.empty((*index.shape, *self.shape[1:]), self.dtype)
@@ -105,7 +105,7 @@ class EpisodeArray:
         self.read_into(out[: self.shape[0]])
         return out
 
-    def read_into(self, out: np.ndarray) -> None:
+    def read_into(self, out: Any) -> None:
         """Reads all frames into memory `[F, ...]`."""
         for path, first in zip(self._paths, self._start, strict=True):
             array = np.load(path, mmap_mode="r", allow_pickle=False)

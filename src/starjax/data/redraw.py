@@ -38,7 +38,7 @@ class Sources(NamedTuple):
     qpos: Any
     episodes: Any
 
-    def at(self, frame: Any, episode: Any) -> Any:
+    def at(self, frame: jax.Array, episode: jax.Array) -> Any:
         """Returns the `ImageSource` `[...]` of frames `[...]` of episodes `[...]`."""
         sources = jax.tree.map(lambda leaf: leaf[episode], self.episodes)
         return sources._replace(qpos=self.qpos[frame])
@@ -54,7 +54,13 @@ class DrawnImages:
 
     dtype = np.dtype(np.uint8)
 
-    def __init__(self, draw: Callable[[Any, Any], jax.Array], qpos: Any, episode: Any, size: int):
+    def __init__(
+        self,
+        draw: Callable[[Any, Any], jax.Array],
+        qpos: np.ndarray,
+        episode: np.ndarray,
+        size: int,
+    ):
         """Keeps what the images are drawn from.
 
         Args:
@@ -66,7 +72,7 @@ class DrawnImages:
         self._draw, self._qpos, self._episode = draw, np.asarray(qpos), np.asarray(episode)
         self.shape = (len(self._qpos), size, size, 3)
 
-    def __getitem__(self, index: Any) -> np.ndarray:
+    def __getitem__(self, index: np.ndarray) -> np.ndarray:
         """Draws the images at `index`, integers `[...]`, as `[..., h, w, 3]` in host memory."""
         index = np.asarray(index)
         rows, batch = index.reshape(-1), batch_size()
@@ -226,7 +232,7 @@ def precompile(env: Env, demos: int) -> dict[str, Any]:
 def _start_program(reset: Callable[..., Any]) -> Program:
     """Returns the program from keys and trocars `[D]` to `Sources.episodes`."""
 
-    def draw_start(key: jax.Array, trocar: Any) -> ImageSource:
+    def draw_start(key: jax.Array, trocar: Trocar) -> ImageSource:
         state = reset(key, EnvParams(trocar))
         still = jnp.zeros(0)  # replaced by each frame's
         return ImageSource(still, state.trocar.p_world_trocar, state.layout, state.cameras)

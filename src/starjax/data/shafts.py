@@ -6,18 +6,19 @@ import jax
 import numpy as np
 
 from starjax import rcm
+from starjax.core.types import Array
 
 ROWS = 1024  # poses that an estimate is made of, at most
 _estimate = jax.jit(rcm.trocar_from_poses)
 _shaft_of = jax.jit(rcm.shaft_of, static_argnums=0)
 
 
-def subsample(x: Any) -> np.ndarray:
+def subsample(x: Array) -> np.ndarray:
     """Returns at most `ROWS` evenly spaced rows of `[T, ...]`."""
     return np.asarray(x)[np.linspace(0, len(x) - 1, min(len(x), ROWS)).astype(int)]
 
 
-def estimate(R: Any, p: Any) -> rcm.TrocarEstimate:
+def estimate(R: Array, p: Array) -> rcm.TrocarEstimate:
     """Estimates the trocars of A arms from their motion.
 
     Args:
@@ -28,7 +29,7 @@ def estimate(R: Any, p: Any) -> rcm.TrocarEstimate:
       Numpy fields `[A, ...]`.
     """
 
-    def rows(x: Any) -> np.ndarray:
+    def rows(x: Array) -> np.ndarray:
         some = subsample(x)
         padded = np.full((ROWS, *some.shape[1:]), np.nan, np.float32)
         padded[: len(some)] = some
@@ -37,7 +38,7 @@ def estimate(R: Any, p: Any) -> rcm.TrocarEstimate:
     return jax.device_get(_estimate(rcm.Pose(*map(jax.device_put, (rows(R), rows(p))))))
 
 
-def of_wrist(R: Any, p: Any, wrist: rcm.Wrist, angles: Any) -> rcm.Pose:
+def of_wrist(R: Any, p: Any, wrist: rcm.Wrist, angles: np.ndarray) -> rcm.Pose:
     """Returns the shafts `[T]` of tips with a wrist, in numpy.
 
     Args:

@@ -13,9 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
-from starjax.core.types import Command, Observation
+from starjax.core.types import Array, Command, Observation, Tree
 
-Array = jax.Array | np.ndarray
 _CHUNK = 1 << 13
 
 
@@ -167,7 +166,7 @@ def control_steps(dataset: Dataset, frame: jax.Array) -> jax.Array:
 
 
 def gather(
-    dataset: Dataset, frame: Array, obs_horizon: int, horizon: int, seen: Any = None
+    dataset: Dataset, frame: Array, obs_horizon: int, horizon: int, seen: Array | None = None
 ) -> Batch:
     """Gathers the windows at frames `[...]`, as arrays of the dataset's kind (numpy or jax).
 
@@ -223,5 +222,5 @@ def on_device(dataset: Dataset) -> bool:
     return isinstance(dataset.episode, jax.Array)
 
 
-def _take(tree: Any, index: np.ndarray) -> Any:
+def _take(tree: Tree, index: np.ndarray) -> Tree:
     return jax.tree.map(lambda leaf: np.asarray(leaf[index]), tree)

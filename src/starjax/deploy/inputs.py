@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import core
+from jax.typing import ArrayLike
 
 from starjax import rcm
 from starjax.core import types
@@ -89,8 +90,8 @@ class InputSpec(NamedTuple):
 
 def validate(
     spec: InputSpec,
-    observation: Any,
-    trocar: Any,
+    observation: RobotObservation | types.Observation,
+    trocar: rcm.Trocar | ArrayLike,
     max_off_trocar: float = guard.MAX_OFF_TROCAR,
 ) -> tuple[types.Observation, rcm.Trocar]:
     """Checks the inputs; returns them as arrays, with trocars `[*robots, *arms]`.
@@ -196,7 +197,7 @@ def _check_values(
     sensors: types.Observation,
     trocar: rcm.Trocar,
     leading: int,
-    shaft: Any,
+    shaft: Pose | None,
     max_off_trocar: float,
 ) -> None:
     """Raises UsageError for values that no robot measures, and tools off their trocar."""

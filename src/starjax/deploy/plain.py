@@ -8,6 +8,7 @@ A row has, for each arm, the tip's x y z in m, its quaternion x y z w and the gr
 
 from typing import Any
 
+import jax
 import numpy as np
 
 from starjax import rcm
@@ -38,7 +39,11 @@ def input_spec(env: sim_env.Env, settings: config.PolicyConfig) -> InputSpec:
 
 
 def encode(
-    spec: InputSpec, prompt: str, observation: RobotObservation, trocar: rcm.Trocar, key: Any = None
+    spec: InputSpec,
+    prompt: str,
+    observation: RobotObservation,
+    trocar: rcm.Trocar,
+    key: jax.Array | None = None,
 ) -> dict[str, Any]:
     """Collects the arrays of a request; of the observation `[1]` its latest moment.
 

@@ -206,7 +206,7 @@ class PlanExecutor:
         self.report.latencies.append(self._waited)
         return True
 
-    def begin(self, pose: Pose, gripper: np.ndarray) -> Command:
+    def begin(self, pose: Pose, gripper: Any) -> Command:
         """Returns the first command to hold: the measured pose `[*arms]`, put through the trocar.
 
         Raises:

@@ -12,7 +12,8 @@ from jax.experimental import io_callback
 from starjax import rcm
 from starjax.core import types
 from starjax.core.errors import UsageError
-from starjax.core.types import Command, Pose
+from starjax.core.types import Array, Command, Observation, Pose
+from starjax.data.normalizer import Normalizer
 from starjax.deploy import connection_pool, greeting, inputs
 
 
@@ -44,7 +45,12 @@ class RemotePolicy:
         self.fault: Exception | None = None
 
     def sample(
-        self, done: Any, stats: Any, keys: jax.Array, observation: Any, trocar: rcm.TrocarFrame
+        self,
+        done: Array,
+        stats: Normalizer,
+        keys: jax.Array,
+        observation: Observation,
+        trocar: rcm.TrocarFrame,
     ) -> Command:
         """Plans as `Policy.sample`; `done` `[B]` bool are the episodes without need of a plan."""
         batch, arms = observation.gripper.shape[0], observation.gripper.shape[2:]
@@ -55,7 +61,7 @@ class RemotePolicy:
         data = jax.random.key_data(keys)
         return io_callback(self._plans, result, done, data, seen, trocar.trocar)
 
-    def _plans(self, done: Any, keys: Any, seen: Any, trocar: Any) -> Command:
+    def _plans(self, done: Array, keys: Any, seen: Observation, trocar: rcm.Trocar) -> Command:
         if self.fault:
             raise self.fault
         done, keys, seen, trocar = jax.tree.map(np.asarray, (done, keys, seen, trocar))

@@ -100,7 +100,7 @@ def _from_plain(spec: InputSpec, request: Arrays) -> Arrays:
     return renamed
 
 
-def _from_state(spec: InputSpec, rows: Any) -> Arrays:
+def _from_state(spec: InputSpec, rows: np.ndarray) -> Arrays:
     width = pose_rows.COLUMNS * (spec.arms[0] if spec.arms else 1)
     shape = np.shape(rows)
     if not isinstance(rows, np.ndarray) or rows.dtype.kind not in "fiu" or shape[-1:] != (width,):

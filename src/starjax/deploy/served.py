@@ -10,7 +10,7 @@ import numpy as np
 from starjax import rcm
 from starjax.core import config, config_json
 from starjax.core.errors import UsageError
-from starjax.core.types import Command
+from starjax.core.types import Command, Observation
 from starjax.deploy import batching, connection_pool, greeting, inputs, plain, remote_policy, wire
 from starjax.policies import in_env, policy_file
 from starjax.policies.base import Policy
@@ -95,7 +95,7 @@ def _policy(remote: remote_policy.RemotePolicy, task: Task) -> Policy:
         raise NotImplementedError("a served policy is trained elsewhere")
 
     def sample(
-        done: Any, stats: Any, keys: jax.Array, observation: Any, trocar: rcm.TrocarFrame
+        done: Any, stats: Any, keys: jax.Array, observation: Observation, trocar: rcm.TrocarFrame
     ) -> Command:
         plan = remote.sample(done, stats, keys, observation, trocar)
         return wrists.through(task, plan, trocar.p_world_trocar[:, None])
@@ -104,7 +104,7 @@ def _policy(remote: remote_policy.RemotePolicy, task: Task) -> Policy:
 
 
 def _first_answer(
-    connections: connection_pool.ConnectionPool,
+    connections: Any,
     encode: Callable[..., dict[str, Any]],
     example: wire.Request,
 ) -> Any:

@@ -128,7 +128,7 @@ def metadata(policy: Deployed, name: str = "", batch: int = 1) -> dict[str, Any]
     }
 
 
-def _plain(record: Any) -> dict[str, Any]:
+def _plain(record: NamedTuple) -> dict[str, Any]:
     """Returns the fields of a NamedTuple, tuples as lists."""
     return {k: list(v) if isinstance(v, tuple) else v for k, v in record._asdict().items()}
 
@@ -242,7 +242,7 @@ class _Server:
         log.answered += 1
         return wire.pack(reply)
 
-    def _admit(self, connection: sockets.ServerConnection, request: Any) -> Any:
+    def _admit(self, connection: sockets.ServerConnection, request: websockets.Request) -> Any:
         """Returns None for a client that may connect, else the response that refuses it."""
         if request.path == "/healthz":
             return connection.respond(http.HTTPStatus.OK, "OK\n")

@@ -108,7 +108,7 @@ def pack(value: Any) -> bytes:
     return frame
 
 
-def unpack(frame: Any) -> Any:
+def unpack(frame: bytes | str) -> Any:
     """Unpacks a frame.
 
     Raises:

@@ -9,8 +9,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from starjax import runtime
+from starjax.core.types import Array, Tree
 from starjax.envs import forked, mdp
 from starjax.envs.settings import EnvSettings
 from starjax.runtime.precompile import Program
@@ -122,17 +124,17 @@ def of_episodes(made: mdp.Episodes, lanes: int) -> EpisodeBatch:
     return EpisodeBatch(made, empty, Program(advance), camera, observed)
 
 
-def seeded(lanes: Lanes, seeds: Any, which: Any) -> Lanes:
+def seeded(lanes: Lanes, seeds: np.ndarray, which: Array) -> Lanes:
     """Returns the lanes, those of `which` with keys of `seeds` `[N]` uint32 and no episode yet."""
     keys = jax.vmap(jax.random.key)(jnp.asarray(seeds))
     fresh = lanes._replace(key=keys, episode=jnp.zeros_like(lanes.episode))
     return _merged(which, fresh, lanes)
 
 
-def _merged(which: jax.Array, a: Any, b: Any) -> Any:
+def _merged(which: Array, a: Tree, b: Tree) -> Tree:
     """Leaves `[N, ...]` of `a` where `which` `[N]`, else of `b`."""
     return jax.tree.map(lambda x, y: _where(which, x, y), a, b)
 
 
-def _where(which: jax.Array, a: jax.Array, b: jax.Array) -> jax.Array:
+def _where(which: Array, a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.where(jnp.reshape(which, (-1,) + (1,) * (jnp.ndim(b) - 1)), a, b)

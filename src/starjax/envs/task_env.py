@@ -6,6 +6,7 @@ import gymnasium
 import jax
 import numpy as np
 from gymnasium.vector import AutoresetMode
+from jax.typing import ArrayLike
 
 from starjax.envs import vector
 
@@ -46,7 +47,7 @@ class TaskEnv(gymnasium.Env):
         observed, info = self._lanes.reset(seed=seed)
         return _only(observed), _numbers(info)
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Advances one control step (1/30 s) towards `action` `[D]` in [-1, 1]."""
         observed, reward, terminated, truncated, info = self._lanes.step(np.asarray(action)[None])
         return (

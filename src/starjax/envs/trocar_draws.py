@@ -9,13 +9,14 @@ import numpy as np
 
 from starjax import rcm
 from starjax.core import errors
+from starjax.envs.settings import Chosen
 from starjax.sim import sampling, trocar_region
 from starjax.sim.task import Task
 
 Draw = Callable[[jax.Array], rcm.Trocar]
 
 
-def make(task: Task, trocar: Any) -> Draw:
+def make(task: Task, trocar: Chosen) -> Draw:
     """Makes key -> trocars, fields `[A]`.
 
     Args:
@@ -38,7 +39,7 @@ def make(task: Task, trocar: Any) -> Draw:
     return _listed(task, np.flatnonzero(rows[trocar]))
 
 
-def _fixed(task: Task, trocar: Any) -> rcm.Trocar:
+def _fixed(task: Task, trocar: tuple[Any, ...]) -> rcm.Trocar:
     """Returns a trocar given by parameters or positions, fields `[A]`."""
     reference = np.array([slot.p_world_ref for slot in task.slots], np.float32)
     is_parameters = isinstance(trocar, rcm.Trocar)

@@ -9,8 +9,10 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
+from jax.typing import ArrayLike
 
 from starjax.core import errors
+from starjax.core.types import ArrayTree
 from starjax.envs import batch, forked, observing, settings
 
 METADATA = {"render_modes": ["rgb_array"], "render_fps": 30}
@@ -118,7 +120,9 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
         observed, measured = _to_host(now)
         return observed, _info(measured, which)
 
-    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(
+        self, actions: ArrayLike
+    ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advances every lane by one control step (1/30 s).
 
         Args:
@@ -163,7 +167,7 @@ class TaskVectorEnv(gymnasium.vector.VectorEnv):
             raise errors.UsageError("seed", f"one or {self.num_envs} of them", len(seed))
         return [None if each is None else checked_seed(each) for each in seed]
 
-    def _mask(self, mask: Any) -> np.ndarray:
+    def _mask(self, mask: ArrayLike | None) -> np.ndarray:
         mask = np.asarray(mask)
         if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
             expected = f"[{self.num_envs}] bool, some of them true"
@@ -216,6 +220,6 @@ def _info(measured: dict[str, np.ndarray], which: np.ndarray) -> dict[str, np.nd
     return {name: np.where(which, x, np.zeros_like(x)) for name, x in measured.items()} | masks
 
 
-def _to_host(tree: Any) -> Any:
+def _to_host(tree: ArrayTree) -> Any:
     """Copies to writable arrays on the host."""
     return jax.tree.map(np.array, jax.device_get(tree))

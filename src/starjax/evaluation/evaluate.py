@@ -21,6 +21,7 @@ import jax
 import numpy as np
 
 from starjax.core import errors, sources
+from starjax.core.types import ArrayTree
 from starjax.data import schema
 from starjax.evaluation import alarms, recorded
 from starjax.evaluation import trials as tables
@@ -185,7 +186,7 @@ def most_lanes(device: jax.Device) -> int:
     return GPU_LANES if limit >= SMALL_GPU_BYTES else SMALL_GPU_LANES
 
 
-def fingerprint(tree: Any) -> str:
+def fingerprint(tree: ArrayTree) -> str:
     """Returns the SHA-256 of all arrays of a pytree and of their paths in it."""
     digest = hashlib.sha256()
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):

@@ -62,7 +62,7 @@ def from_episodes(episodes: Sequence[Episode]) -> Table:
     """Returns the table of episodes with the fields of `episodes.SCORE`."""
     outcomes = [episode.outcome for episode in episodes]
 
-    def column(name: str, kind: Any) -> np.ndarray:
+    def column(name: str, kind: type) -> np.ndarray:
         return np.array([outcome[name] for outcome in outcomes], kind)
 
     def errors(name: str) -> list[np.ndarray]:

@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from starjax.core.types import ArrayTree
 from starjax.policies import sequences
 from starjax.policies.models import diffusion, kernels, unet1d
 from starjax.policies.models.process import Process
@@ -31,10 +32,12 @@ def make(
         condition = jnp.zeros((1, unet.cond_dim))
         return {"unet": unet.init(key, jnp.zeros((1, *shape)), jnp.zeros(1, jnp.int32), condition)}
 
-    def loss(params: Params, condition: Condition, given: Any) -> tuple[jax.Array, dict]:
+    def loss(params: Params, condition: Condition, given: ArrayTree) -> tuple[jax.Array, dict]:
         joined = sequences.condition_vector(condition)  # c, [B, C]
 
-        def predict(x: jax.Array, time: jax.Array, rows: Any = slice(None)) -> jax.Array:
+        def predict(
+            x: jax.Array, time: jax.Array, rows: slice | jax.Array = slice(None)
+        ) -> jax.Array:
             return apply(params["unet"], x, time, joined[rows])
 
         return process.loss(predict, given), {}  # Eq. 9 for diffusion

@@ -89,7 +89,9 @@ def history_dim(policy_config: config.PolicyConfig, task: Task, proprioception: 
     """Returns the size of `Inputs.history`; `proprioception` is that of measured poses."""
     if policy_config.observation == "image":
         return proprioception
-    state, tips = jnp.zeros(task.state_size), jnp.zeros((task.arms, 3))
+    state, tips = (
+        jax.ShapeDtypeStruct(s, np.float32) for s in ((task.state_size,), (task.arms, 3))
+    )
     relative = jax.eval_shape(task.relative, state, tips)
     return proprioception + task.state_size + relative.shape[-1]
 

@@ -106,7 +106,7 @@ def cast_params(params: Params, names: set[str], dtype: DTypeLike) -> Any:
     many evaluations.
     """
 
-    def one(path: tuple[Any, ...], leaf: Any) -> Any:
+    def one(path: tuple[Any, ...], leaf: jax.Array) -> Any:
         return leaf.astype(dtype) if getattr(path[-1], "key", None) in names else leaf
 
     return jax.tree_util.tree_map_with_path(one, params)

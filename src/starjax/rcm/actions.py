@@ -26,6 +26,7 @@ from jax.typing import ArrayLike
 
 from starjax.core import types
 from starjax.core.registry import Registry, Rows
+from starjax.core.types import ArrayTree
 from starjax.rcm import arrays, manifold, rotations
 from starjax.rcm import trocar as trocars
 from starjax.rcm import wrist as wrists
@@ -141,7 +142,7 @@ class SpaceFrame(NamedTuple):
 def _fixed_yaw(encode_or_decode: Callable) -> Callable:
     """Wraps a map, with the world's x axis as that of {T} at every trocar."""
 
-    def mapped(pose_or_parts: Any, frame: SpaceFrame) -> Any:
+    def mapped(pose_or_parts: ArrayTree, frame: SpaceFrame) -> Any:
         return encode_or_decode(pose_or_parts, frame._replace(R=_down(frame.R.dtype)))
 
     return mapped

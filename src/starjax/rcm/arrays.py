@@ -134,7 +134,7 @@ def taint(x: jax.Array) -> jax.Array:
     return jnp.sum(x - x, axis=-1, keepdims=True)  # x - x is 0, or NaN for NaN and infinity
 
 
-def epsilon(dtype: Any) -> float:
+def epsilon(dtype: np.dtype) -> float:
     """Returns the length (m, or sine of an angle) below which a direction is undefined.
 
     It also bounds derivatives: they grow like 1 / length towards a singular point.

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from starjax.core.types import Pose
+from starjax.core.types import ArrayTree, Pose
 from starjax.sim import registries, scene, still_bodies, thread_geoms
 from starjax.sim.camera import geometry
 from starjax.sim.names import SceneNames
@@ -99,7 +99,7 @@ def _film(names: SceneNames, size: int) -> Film:
     scope = endoscope_camera.of(task, names.cameras[:1])
     (view,) = cameras.make(model, names.cameras[:1], size, scope=scope, samples=samples)
 
-    def batch(poses: Any, labels: dict[str, Any]) -> jax.Array:
+    def batch(poses: ArrayTree, labels: dict[str, Any]) -> jax.Array:
         with jax.default_matmul_precision("highest"):  # float32 rays, as in the environment
             rgb = scene.marked(task, bound, labels, jnp.asarray(geom_rgb))
             return jax.lax.map(lambda step: view.draw(*step[:2], rgb, *step[2:]).rgb, poses)

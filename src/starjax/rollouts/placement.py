@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from starjax.core.types import ArrayTree
 from starjax.runtime import precompile
 
 SHARED = PartitionSpec()
@@ -63,7 +64,7 @@ def split(
         lambda spec: NamedSharding(mesh, spec), list(in_specs), is_leaf=_is_spec
     )
 
-    def call(*arguments: Any) -> Any:
+    def call(*arguments: ArrayTree) -> Any:
         placed = [jax.device_put(*pair) for pair in zip(arguments, shardings, strict=True)]
         shares = [jax.tree.map(lambda x, d=device: _share(x, d), placed) for device in devices]
         # Traced here, once, and not in every thread.

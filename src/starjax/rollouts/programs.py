@@ -4,7 +4,7 @@ They are compiled once for the same functions: data, e.g. trials and levels, are
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -110,7 +110,9 @@ def _programs(
 
 
 def _starter(env: _EnvFns, agent: _AgentFns) -> Callable[..., RolloutState]:
-    def start_one(key: jax.Array, trials: Trials, levels: Any) -> tuple[Any, jax.Array]:
+    def start_one(
+        key: jax.Array, trials: Trials, levels: Mapping[str, jax.Array] | None
+    ) -> tuple[Any, jax.Array]:
         # The trial's own key: its lane and its neighbours have no part in it.
         key = jax.random.fold_in(jax.random.fold_in(key, trials.index), trials.trial)
         key_env, key_agent = jax.random.split(key)

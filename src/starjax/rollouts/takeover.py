@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from starjax.core.types import Tree
 from starjax.rollouts import episodes, placement, progress
 from starjax.rollouts.agent import BatchAgent, Observe
 from starjax.sim import wrists
@@ -108,7 +109,7 @@ def _last(acted: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
     return executed, label, memory
 
 
-def _where(which: jax.Array, a: Any, b: Any) -> Any:
+def _where(which: jax.Array, a: Tree, b: Tree) -> Tree:
     """Returns the leaves `[N, ...]` of `a` in the episodes `which` `[N]`, else those of `b`."""
 
     def choose(x: jax.Array, y: jax.Array) -> jax.Array:

@@ -4,8 +4,10 @@ from typing import Any
 
 import numpy as np
 
+from starjax.core.types import Array
 
-def lowbias32(x: Any) -> Any:
+
+def lowbias32(x: Array) -> Any:
     """Hashes each number of a uint32 array, of numpy or jax (C. Wellons's `lowbias32`).
 
     No two numbers have the same hash. Changing one bit of a number changes each bit of its hash

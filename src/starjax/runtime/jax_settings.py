@@ -116,7 +116,7 @@ def _flags() -> dict[str, str]:
     return {name: value.lower() if equals else "true" for name, equals, value in words}
 
 
-def _differs(name: str, default: Any) -> bool:
+def _differs(name: str, default: str | bool | float | None) -> bool:
     return name in jax.config.values and _plain(_value(name)) != default
 
 

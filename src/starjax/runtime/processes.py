@@ -24,6 +24,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import NamedSharding
 
 from starjax.core import errors
+from starjax.core.types import Array, Tree
 from starjax.runtime import background
 
 _VARIABLES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
@@ -161,7 +162,7 @@ def expect_same(what: str, text: str, values: Any = None) -> None:
         raise errors.UsageError(what, "the same in all processes", got)
 
 
-def spread(x: Any, sharding: NamedSharding, may_alias: bool | None) -> jax.Array:
+def spread(x: Array, sharding: NamedSharding, may_alias: bool | None) -> jax.Array:
     """Returns an array over the devices of all processes, of which each holds all of `x`.
 
     `may_alias`, of `jax.device_put`: whether it may share the memory of `x`.
@@ -175,7 +176,7 @@ def spread(x: Any, sharding: NamedSharding, may_alias: bool | None) -> jax.Array
     return jax.make_array_from_single_device_arrays(x.shape, sharding, parts)
 
 
-def own(tree: Any) -> Any:
+def own(tree: Tree) -> Tree:
     """Returns this process's copy of arrays that are replicated over all processes."""
     if is_alone():
         return tree

@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
+from types import FrameType
 
 # Slurm and LSF warn by a signal of the user's choice, Grid Engine by SIGUSR1 and SIGUSR2. Some
 # systems do not have all of them.
@@ -58,7 +58,7 @@ def stop_signals() -> Iterator[Callable[[], bool]]:
     """
     is_requested = False
 
-    def ask(number: int, frame: Any) -> None:
+    def ask(number: int, frame: FrameType | None) -> None:
         nonlocal is_requested
         _drop_dead_outputs(number)
         if is_requested:
@@ -85,7 +85,7 @@ def _heard() -> list[signal.Signals]:
     return [number for number in STOPS if signal.getsignal(number) != signal.SIG_IGN]
 
 
-def _interrupt(number: int, frame: Any) -> None:
+def _interrupt(number: int, frame: FrameType | None) -> None:
     global _answered
     _answered = True
     _drop_dead_outputs(number)
@@ -94,7 +94,7 @@ def _interrupt(number: int, frame: Any) -> None:
     raise KeyboardInterrupt
 
 
-def _interrupt_again(number: int, frame: Any) -> None:
+def _interrupt_again(number: int, frame: FrameType | None) -> None:
     if not isinstance(sys.exc_info()[1], KeyboardInterrupt):
         raise KeyboardInterrupt
 

@@ -10,7 +10,7 @@ import jax
 _CONSTANTS = (type(None), bool, int, float, str)
 
 
-def encode(structure: Any) -> Any:
+def encode(structure: jax.tree_util.PyTreeDef) -> Any:
     """Returns a `PyTreeDef` as a JSON value.
 
     Raises:
@@ -65,6 +65,6 @@ def _decode(value: Any) -> Any:
     return kind(**{name: _decode(x) if is_node[name] else x for name, x in parts.items()})
 
 
-def _fields(kind: Any) -> dict[str, bool]:
+def _fields(kind: type) -> dict[str, bool]:
     """Returns whether each field of a flax dataclass is a node of the tree, not a constant."""
     return {f.name: f.metadata.get("pytree_node", True) for f in dataclasses.fields(kind)}

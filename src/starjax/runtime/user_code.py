@@ -9,13 +9,13 @@ from typing import Any
 from starjax.core import errors
 
 
-def place(function: Any) -> str:
+def place(function: Callable[..., Any]) -> str:
     """Returns file and line of a function, e.g. `lid.py:33`; empty for an object without code."""
     code = getattr(getattr(function, "__wrapped__", function), "__code__", None)
     return f"{Path(code.co_filename).name}:{code.co_firstlineno}" if code else ""
 
 
-def subject(part: str, name: str, function: Any) -> str:
+def subject(part: str, name: str, function: Callable[..., Any]) -> str:
     """Returns the argument of errors, e.g. `task lid: status (lid.py:33)`."""
     where = place(function)
     return f"{part}: {name} ({where})" if where else f"{part}: {name}"
@@ -46,7 +46,7 @@ def _first_line(error: Exception) -> str:
     return next((line for line in str(error).splitlines() if line.strip()), "")
 
 
-def _line_in(function: Any, error: Exception) -> str:
+def _line_in(function: Callable[..., Any], error: Exception) -> str:
     """Returns the innermost line of an error in the function's file, e.g. ` in lid.py:40`."""
     code = getattr(function, "__code__", None)
     frames = traceback.extract_tb(error.__traceback__)

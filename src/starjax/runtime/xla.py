@@ -194,7 +194,7 @@ def _limit(group: Path, limit: str, usage: str, reclaimed: str) -> tuple[int, in
     return most, used - int(stat.get(reclaimed, 0))  # the kernel drops cached files in need
 
 
-def _set_default(option: str, value: Any) -> None:
+def _set_default(option: str, value: str | float) -> None:
     """Sets an option of jax by its variable, for children too, unless the user has."""
     if option.upper() in os.environ:
         return

@@ -1,7 +1,10 @@
 """Reads a serial arm off a compiled model: a chain of hinges and slides."""
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
+from jax.typing import ArrayLike
 
 from starjax.core import errors
 from starjax.sim.ik import Chain
@@ -106,7 +109,7 @@ def _about_z(angle: float) -> np.ndarray:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _float32(x: object) -> np.ndarray:
+def _float32(x: ArrayLike | Sequence[np.ndarray]) -> np.ndarray:
     return np.asarray(x, np.float32)
 
 

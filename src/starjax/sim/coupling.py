@@ -5,14 +5,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from starjax.core.types import Pose
+from starjax.core.types import ArrayTree, Pose
 from starjax.sim import ik, wrist_motion
 from starjax.sim import scene as scenes
 from starjax.sim.task import StepReadings
 
 
 def begin(
-    scene: scenes.Scene, layout: object, qpos: jax.Array, p_world_trocar: jax.Array
+    scene: scenes.Scene, layout: ArrayTree, qpos: jax.Array, p_world_trocar: jax.Array
 ) -> tuple[jax.Array, Any]:
     """Returns the coordinates with the objects that tools hold, and the memory at reset."""
     task = scene.task
@@ -23,7 +23,11 @@ def begin(
 
 
 def forces(
-    scene: scenes.Scene, layout: object, state: Any, gripper: jax.Array, p_world_trocar: jax.Array
+    scene: scenes.Scene,
+    layout: ArrayTree,
+    state: Any,
+    gripper: jax.Array,
+    p_world_trocar: jax.Array,
 ) -> tuple[jax.Array | None, Any]:
     """Returns the generalised forces `[V]` and the memory after them, or None of both.
 

@@ -9,6 +9,7 @@ objects, see `camera.tissue`.
 
 import copy
 from collections.abc import Collection, Iterator
+from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
@@ -16,7 +17,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from starjax.core.types import Pose
+from starjax.core.types import Array, Pose
 from starjax.sim.camera import geometry, tissue
 from starjax.sim.names import DEPTH, TISSUE
 
@@ -82,7 +83,7 @@ def decode(image: np.ndarray) -> np.ndarray:
     return decode_scaled(np.asarray(image, np.float32) / 255.0, np)
 
 
-def decode_scaled(image: Any, np_: Any) -> Any:
+def decode_scaled(image: Array, np_: ModuleType) -> Any:
     """Returns the depth `[..., h, w]` in m of images `[..., h, w, 3]` in [0, 1].
 
     `np_` is the module of the array, numpy or jax.numpy.

@@ -9,13 +9,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
-from starjax.core.types import Pose
+from starjax.core.types import Array, Pose
 from starjax.rcm import trocar as trocars
 from starjax.sim.names import TISSUE
 
 if TYPE_CHECKING:  # a robot loads tasks without the simulator
     import mujoco
+
+    from starjax.sim.task import Task
 
 NAME = "endoscope"  # name of the camera
 STREAM = 0x73636F70  # folded into an episode's key: objects and tips are drawn as without it
@@ -45,7 +48,7 @@ class Endoscope(NamedTuple):
     fovy: float
 
 
-def of(task: Any, cameras: Sequence[str]) -> Endoscope | None:
+def of(task: "Task", cameras: Sequence[str]) -> Endoscope | None:
     """Returns the task's endoscope, or None unless it is among the observed cameras."""
     return task.endoscope if any(map(is_endoscope, cameras)) else None
 
@@ -92,7 +95,11 @@ def add(world: "mujoco.MjSpec", endoscope: Endoscope) -> None:
 
 
 def looking_at(
-    target: Any, p_trocar: Any, distance: Any, up: Any, lean: tuple[Any, Any] = (0.0, 1.0)
+    target: Array,
+    p_trocar: Array,
+    distance: ArrayLike,
+    up: Any,
+    lean: tuple[Any, Any] = (0.0, 1.0),
 ) -> Pose:
     """Returns the one pose of a scope's camera with the target in the middle of a level image.
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.spatial.transform import Rotation
 
+from starjax.core.types import ArrayTree
 from starjax.sim import coupling, solver
 from starjax.sim.quiet_mjx import mjx
 from starjax.sim.scene import BoundArm, Scene
@@ -53,7 +54,7 @@ class StepResult(NamedTuple):
 def initial(
     scene: Scene,
     q: Sequence[jax.Array],
-    layout: object,
+    layout: ArrayTree,
     p_world_trocar: jax.Array | None = None,
 ) -> PhysicsState:
     """Returns the state at rest: arms at `q` (`[J]` rad), jaws open, objects placed.
@@ -88,7 +89,7 @@ def advance(
     gripper: jax.Array,
     p_world_trocar: jax.Array,
     period: float,
-    layout: object,
+    layout: ArrayTree,
     time: jax.Array,
     own: Mapping[str, jax.Array] = types.MappingProxyType({}),
 ) -> tuple[PhysicsState, StepResult]:
@@ -150,7 +151,7 @@ def servo_targets(
     velocity: Sequence[jax.Array],
     gripper: jax.Array,
     period: float,
-    layout: object,
+    layout: ArrayTree,
     time: jax.Array,
 ) -> Callable[[jax.Array], jax.Array]:
     """Returns the function from a substep to all servos' targets `[nu]`; arguments as `advance`."""
@@ -196,7 +197,7 @@ def openings(scene: Scene, qpos: jax.Array) -> jax.Array:
 
 
 def kinematics(
-    scene: Scene, qpos: jax.Array, p_world_trocar: jax.Array, layout: object = None
+    scene: Scene, qpos: jax.Array, p_world_trocar: jax.Array, layout: ArrayTree | None = None
 ) -> mjx.Data:
     """Computes the poses of all bodies and geoms, with markers at `p_world_trocar` `[A, 3]` m.
 

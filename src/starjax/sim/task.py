@@ -12,7 +12,7 @@ import numpy as np
 
 from starjax import rcm
 from starjax.core import registry
-from starjax.core.types import Agent, Pose
+from starjax.core.types import Agent, ArrayTree, Pose
 from starjax.sim.endoscope_camera import Endoscope
 
 CONTROL_HZ = 30.0  # commands per second
@@ -189,7 +189,7 @@ class SimReadings(NamedTuple):
     collided: jax.Array | None = None
 
 
-def _no_obstacles(bound: Any, layout: Any, measurements: Any) -> Capsules:
+def _no_obstacles(bound: Any, layout: ArrayTree, measurements: ArrayTree) -> Capsules:
     return Capsules(jnp.zeros((0, 3)), jnp.zeros((0, 3)), jnp.zeros(0))
 
 

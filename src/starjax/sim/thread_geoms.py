@@ -8,6 +8,9 @@ from typing import Any
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from mujoco import mjx
+
+from starjax.core.types import Array
 
 GEOM = "thread"
 
@@ -18,14 +21,14 @@ def ids(m: mujoco.MjModel) -> np.ndarray:
     return np.array([g.id for g in sorted(found, key=lambda g: int(g.name[len(GEOM) :]))], int)
 
 
-def split(m: mujoco.MjModel, coordinates: Any) -> tuple[Any, Any]:
+def split(m: mujoco.MjModel, coordinates: Array) -> tuple[Any, Any]:
     """Returns qpos `[Q]` and the thread's points `[N, 3]` m, N = 0 without a thread."""
     if len(coordinates) == m.nq:
         return coordinates, np.zeros((0, 3), np.float32)
     return coordinates[: m.nq], coordinates[m.nq :].reshape(-1, 3)
 
 
-def poses(points: Any) -> tuple[Any, Any]:
+def poses(points: Array) -> tuple[Any, Any]:
     """Returns the links' centres `[N - 1, 3]` m and rotations `[N - 1, 3, 3]`, z along the link."""
     xp = np if isinstance(points, np.ndarray) else jnp
     along = points[1:] - points[:-1]
@@ -36,7 +39,7 @@ def poses(points: Any) -> tuple[Any, Any]:
     return 0.5 * (points[1:] + points[:-1]), xp.stack([x, xp.cross(z, x), z], -1)
 
 
-def placed(m: mujoco.MjModel, data: Any, points: Any) -> Any:
+def placed(m: mujoco.MjModel, data: mjx.Data, points: Array) -> Any:
     """Returns MJX data with the links at the points `[N, 3]` m."""
     if not len(points):
         return data

@@ -1,9 +1,9 @@
 """Region of a task's trocars: the ranges of each slot's workspace about its nominal trocar."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
+from jax.typing import ArrayLike
 
 from starjax.core import errors
 from starjax.sim import registries
@@ -42,7 +42,10 @@ def clipped(region: Region, offset: np.ndarray) -> np.ndarray:
 
 
 def check(
-    regions: Sequence[Region], p_world_ref: Any, p_world_trocar: Any, argument: str = "trocar"
+    regions: Sequence[Region],
+    p_world_ref: ArrayLike,
+    p_world_trocar: ArrayLike,
+    argument: str = "trocar",
 ) -> None:
     """Raises UsageError for trocars farther than `OUTSIDE` from their region.
 

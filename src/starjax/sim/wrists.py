@@ -9,9 +9,10 @@ import jax.numpy as jnp
 
 from starjax import rcm
 from starjax.core import registry
-from starjax.core.types import Agent, Command, Pose
+from starjax.core.types import Agent, ArrayTree, Command, Pose
 from starjax.sim import registries
 from starjax.sim.names import SceneNames
+from starjax.sim.state import EnvState
 from starjax.sim.task import Task
 
 if TYPE_CHECKING:  # it imports the physics
@@ -74,11 +75,11 @@ def _fitted(task: Task, expert: str | Callable[[], Agent]) -> Callable[[], Agent
 def _fitted_act(held: Held, act: Callable[..., Any]) -> Callable[..., Any]:
     """Returns an expert's `act` whose commands bend the wrists held."""
 
-    def fitted(command: Command, state: Any) -> Command:
+    def fitted(command: Command, state: EnvState) -> Command:
         p_world_trocar = state.measured_trocar.p_world_trocar
         return command if command.wrist is None else _through(held, command, p_world_trocar)
 
-    def fitted_act(memory: Any, state: Any) -> tuple[Command, Any, Command]:
+    def fitted_act(memory: ArrayTree, state: EnvState) -> tuple[Command, Any, Command]:
         executed, memory, recorded = act(memory, state)
         return fitted(executed, state), memory, fitted(recorded, state)
 

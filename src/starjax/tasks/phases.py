@@ -13,7 +13,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from starjax.core.types import Agent, Command
+from starjax.core.types import Agent, ArrayTree, Command
 from starjax.sim.state import EnvState
 from starjax.sim.task import CONTROL_HZ
 from starjax.tasks import scripting
@@ -118,7 +118,11 @@ class Grasp(NamedTuple):
 
 
 def begin(
-    kind: Callable[..., ScriptT], timing: PhaseTable, key: jax.Array, at: jax.Array, **own: Any
+    kind: Callable[..., ScriptT],
+    timing: PhaseTable,
+    key: jax.Array,
+    at: jax.Array,
+    **own: ArrayTree,
 ) -> ScriptT:
     """Returns a script of class `kind` before its first phase, with the task's own fields."""
     key_tempo, key = jax.random.split(key)
@@ -151,7 +155,11 @@ def grasp_fields() -> dict[str, jax.Array]:
 
 
 def enter(
-    script: ScriptT, timing: PhaseTable, phase: jax.Array, goals: list[jax.Array], **own: Any
+    script: ScriptT,
+    timing: PhaseTable,
+    phase: jax.Array,
+    goals: list[jax.Array],
+    **own: ArrayTree,
 ) -> ScriptT:
     """Returns the script at the start of `phase`, whose goal is that of `goals` `[P]`."""
     goal = jnp.stack(goals)[phase]

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.scipy.spatial.transform import Rotation
 
 from starjax import rcm
-from starjax.core.types import Command, Pose
+from starjax.core.types import ArrayTree, Command, Pose
 from starjax.sim import ik
 from starjax.sim.state import EnvState
 from starjax.tasks import phases, scripting
@@ -44,7 +44,7 @@ def enter(
     phase: jax.Array,
     goals: list[jax.Array],
     R_goal: jax.Array,
-    **own: Any,
+    **own: ArrayTree,
 ) -> Any:
     """Returns the script at the start of `phase`, see `phases.enter`; `R_goal` is for its end.
 

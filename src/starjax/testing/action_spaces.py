@@ -78,7 +78,7 @@ def _poses() -> tuple[Pose, rcm.TrocarFrame]:
     return Pose(rcm.rotation_from_axis_roll(tips - frame.p_world_trocar, rolls), tips), frame
 
 
-def _types(space: ActionSpace, action: Any, decoded: Any) -> Iterator[str]:
+def _types(space: ActionSpace, action: jax.Array, decoded: Any) -> Iterator[str]:
     if not isinstance(decoded, tuple) or len(decoded) != 2 or not isinstance(decoded[0], Pose):
         yield f"expected a Pose and flags of decode, got {type(decoded).__name__}"
         return

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
-from starjax.core.types import Command, Observation
+from starjax.core.types import ArrayTree, Command, Observation
 from starjax.evaluation.disturbances import DISTURBANCES
 from starjax.evaluation.disturbances import base as disturbances
 from starjax.evaluation.disturbances.base import Disturbance
 from starjax.sim import env as envs
+from starjax.sim.state import EnvState
 from starjax.sim.task import CONTROL_HZ
 from starjax.testing.base import NOTE, Check, attempt, verdict
 
@@ -108,7 +109,7 @@ def _run(env: envs.Env, levels: dict[str, jax.Array] | None) -> tuple[dict[str, 
     trocar = rcm.Trocar(*(jnp.asarray(field[0]) for field in env.task.trocars))
     state = env.reset(jax.random.key(0), envs.EnvParams(trocar, levels=levels))
 
-    def step(state: Any, _: None) -> tuple[Any, None]:
+    def step(state: EnvState, _: None) -> tuple[Any, None]:
         down = jnp.where(state.step < STEPS, DOWN, 0.0)
         pose = state.pose._replace(p=state.pose.p + down)
         return env.step(state, Command(pose, state.gripper)), None
@@ -117,7 +118,7 @@ def _run(env: envs.Env, levels: dict[str, jax.Array] | None) -> tuple[dict[str, 
     return {name: getattr(state, name) for name in FIELDS}, env.observe(state)
 
 
-def _differences(a: Any, b: Any) -> Iterator[str]:
+def _differences(a: ArrayTree, b: ArrayTree) -> Iterator[str]:
     """Yields the leaves in which two episodes differ."""
     first, second = (dict(jax.tree_util.tree_leaves_with_path(tree)) for tree in (a, b))
     for path, leaf in first.items():

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax.core.learners import ENCODERS
+from starjax.core.types import ArrayTree
 from starjax.policies.models.encoders import ImageEncoder, Trunk
 from starjax.runtime import user_code
 from starjax.testing.base import FAILED, NOTE, Check, attempt, failed, verdict
@@ -69,7 +70,7 @@ def _maps(maps: Any) -> Iterator[str]:
         yield f"expected {CELLS} x {CELLS} cells, got {maps.shape[1]} x {maps.shape[2]}"
 
 
-def _unseen(apply: Callable[..., Any], params: Any, images: jax.Array) -> Iterator[str]:
+def _unseen(apply: Callable[..., Any], params: ArrayTree, images: jax.Array) -> Iterator[str]:
     """Yields the channels and quarters of an image that change no feature."""
     before, half = np.asarray(apply(params, images[:1])), images.shape[1] // 2
     slices = {"upper": slice(0, half), "lower": slice(half, None)}
@@ -104,7 +105,7 @@ def _values(encoder: Any, images: jax.Array, reads_depth: bool = False) -> Itera
         unseen = _unseen(apply, params, images)
         yield verdict("input", unseen, "every channel and quarter is seen")
 
-    def loss(p: Any) -> jax.Array:
+    def loss(p: ArrayTree) -> jax.Array:
         features: Any = encoder.apply(p, images)
         return jnp.mean(features**2)
 

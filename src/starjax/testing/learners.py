@@ -13,7 +13,7 @@ from starjax.cli import presets
 from starjax.core import config
 from starjax.core.learners import LEARNERS
 from starjax.policies import learner_contract
-from starjax.policies.sequences import Condition, SequenceModel, Sizes
+from starjax.policies.sequences import Condition, Params, SequenceModel, Sizes
 from starjax.testing.base import Check, attempt, failed, verdict
 
 CONDITIONS = 4
@@ -78,7 +78,7 @@ def _values(text: str, model: SequenceModel, sizes: Sizes) -> Iterator[Check]:
     yield verdict(f"gradient, {text}", faults, f"finite, of a loss of {float(loss):.3g}")
     keys = jnp.tile(jax.random.split(jax.random.key(4), COPIES), CONDITIONS)
 
-    def drawn(params: Any, condition: Condition) -> np.ndarray:
+    def drawn(params: Params, condition: Condition) -> np.ndarray:
         return np.asarray(sample(model.prepare_for_inference(params), keys, condition, None))
 
     yield verdict(
@@ -103,13 +103,13 @@ def _values(text: str, model: SequenceModel, sizes: Sizes) -> Iterator[Check]:
 
 
 def _trained(
-    learned: Callable[..., Any], params: Any, given: Sequence[Any]
+    learned: Callable[..., Any], params: Params, given: Sequence[Any]
 ) -> tuple[Any, np.ndarray]:
     """Returns parameters after a short training, and the losses of its steps."""
     optimiser = optax.adam(LEARNING_RATE)
 
     @jax.jit
-    def update(params: Any, state: Any, gradient: Any) -> tuple[Any, Any]:
+    def update(params: Params, state: optax.OptState, gradient: Params) -> tuple[Any, Any]:
         updates, state = optimiser.update(gradient, state, params)
         return optax.apply_updates(params, updates), state
 
@@ -150,7 +150,7 @@ def _blind(drawn: Callable[[Condition], np.ndarray], condition: Condition) -> It
 def _samples(
     model: SequenceModel,
     sample: Callable[..., jax.Array],
-    params: Any,
+    params: Params,
     condition: Condition,
     keys: jax.Array,
 ) -> Iterator[str]:

@@ -1,14 +1,15 @@
 """Checks of a task's numbers at reset and at the end of demonstrations: success, stages, state."""
 
 from collections.abc import Iterator
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
+from starjax.core.types import ArrayTree
 from starjax.sim.state import Env, EnvParams, EnvState
+from starjax.sim.task import TaskStatus
 from starjax.testing.base import Check, attempt, verdict
 
 RESETS = 16
@@ -47,7 +48,7 @@ def judged(env: Env, states: EnvState) -> Iterator[Check]:
     yield verdict("state", _unit_faults(env, fields, tips), "finite, points in m of the workspace")
 
 
-def _out_of_range(env: Env, status: Any) -> Iterator[str]:
+def _out_of_range(env: Env, status: TaskStatus) -> Iterator[str]:
     stages = len(env.task.stages)
     if (worst := int(np.max(status.stage))) >= stages or np.min(status.stage) < 0:
         yield f"stage {worst}, expected 0 to {stages - 1}"
@@ -72,7 +73,7 @@ def _unit_faults(env: Env, states: np.ndarray, tips: np.ndarray) -> Iterator[str
                 yield f"{field.name} is {far:.3g} m from the tips, at most {FARTHEST:g}: in mm?"
 
 
-def hidden_goals(env: Env, last: Any) -> Iterator[str]:
+def hidden_goals(env: Env, last: EnvState) -> Iterator[str]:
     """Yields a fault if layouts that decide on success look the same in the state.
 
     Each successful end is judged by the layouts of the other episodes.
@@ -85,7 +86,7 @@ def hidden_goals(env: Env, last: Any) -> Iterator[str]:
     if len(ended) < 2:
         return
 
-    def seen(layout: Any, measurements: Any) -> tuple[jax.Array, jax.Array]:
+    def seen(layout: ArrayTree, measurements: ArrayTree) -> tuple[jax.Array, jax.Array]:
         status = task.status(bound, layout, measurements)
         return status.success_now, task.state(bound, layout, measurements)
 

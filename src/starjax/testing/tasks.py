@@ -10,13 +10,14 @@ import numpy as np
 
 from starjax import rcm
 from starjax.core import config, errors
-from starjax.core.types import Pose
+from starjax.core.types import ArrayTree, Pose
 from starjax.data import stillness
 from starjax.evaluation import expert as episodes
 from starjax.rollouts.success_quota import MIN_SUCCESS_RATE
 from starjax.sim import contract, coupling, physics, registries, sampling, task_draws
 from starjax.sim import env as envs
 from starjax.sim.scene import Scene
+from starjax.sim.state import EnvState
 from starjax.sim.task import CONTROL_HZ, SimReadings, Task
 from starjax.testing import task_starts
 from starjax.testing.base import (
@@ -135,7 +136,7 @@ def _functions(scene: Scene) -> Iterator[Check]:
         yield Check("functions", f"{len(calls) + 1} return their types and shapes")
 
 
-def _forces(scene: Scene, layout: Any) -> jax.Array:
+def _forces(scene: Scene, layout: ArrayTree) -> jax.Array:
     """Returns the forces `[V]` of a task's own at reset; raises for another shape."""
     state = physics.initial(scene, [jnp.asarray(bound.home) for bound in scene.arms], layout)
     p_world_trocar, gripper = jnp.asarray(scene.p_world_ref), -jnp.ones(len(scene.arms))
@@ -238,7 +239,7 @@ def _outcomes(env: envs.Env, subject: str, ran: episodes.ExpertEpisodes) -> Iter
         yield Check(f"{subject}, collided", counted(pairs), NOTE)
 
 
-def _stages(last: Any, which: np.ndarray) -> dict[int, int]:
+def _stages(last: EnvState, which: np.ndarray) -> dict[int, int]:
     return dict(zip(*np.unique(np.asarray(last.stage)[which], return_counts=True), strict=True))
 
 

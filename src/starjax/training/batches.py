@@ -9,7 +9,7 @@ import itertools
 import queue
 import threading
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,9 @@ from starjax.runtime import processes
 from starjax.training import devices, randomise
 from starjax.training import state as states
 from starjax.training.sharding import Setup
+
+if TYPE_CHECKING:  # for annotations alone
+    from starjax.training.redrawing import Displaced
 
 _AHEAD = 2  # batches that wait for their steps
 _CHUNK = 64  # steps whose frames are drawn at once
@@ -199,7 +202,7 @@ def drawn_batch(
     dataset: windows.Dataset,
     frames: jax.Array,
     available: jax.Array,
-    displaced: Any = None,
+    displaced: "Displaced | None" = None,
 ) -> windows.Batch:
     """Returns the batch of a step, split over the devices; `key` and `step` are the state's.
 
@@ -216,20 +219,25 @@ def drawn_batch(
 
 
 def _disturbed(
-    setup: Setup, key: Any, step: Any, batch: windows.Batch, displaced: Any, *data: Any
+    setup: Setup,
+    key: jax.Array,
+    step: jax.Array,
+    batch: windows.Batch,
+    displaced: "Displaced | None",
+    *data: Any,
 ) -> windows.Batch:
     return disturbed(setup, choose(setup, key, step, *data), batch, displaced)
 
 
 def disturbed(
-    setup: Setup, choice: Choice, batch: windows.Batch, displaced: Any = None
+    setup: Setup, choice: Choice, batch: windows.Batch, displaced: "Displaced | None" = None
 ) -> windows.Batch:
     """Disturbs the images of a gathered batch."""
     if choice.draws is None:
         return batch
     if displaced is not None:
-        # This step's, of several
-        displaced = jax.tree.map(lambda x: x[:, displaced.index], displaced.images)
+        index = displaced.index  # this step's, of several
+        displaced = jax.tree.map(lambda x: x[:, index], displaced.images)
     names = list(randomise.max_levels(setup.train_config))
 
     def change(draws: Any, seen: Any, observation: Any, displaced: Any) -> Any:

@@ -17,6 +17,7 @@ from typing import Any
 import jax
 from orbax.checkpoint import v1 as ocp
 
+from starjax.core.types import ArrayTree
 from starjax.runtime import files, processes
 
 _MANIFEST = "manifest.json"
@@ -165,7 +166,7 @@ def _hash_of_manifest(manifest: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
 
 
-def _leaves(tree: Any) -> dict[str, str]:
+def _leaves(tree: ArrayTree) -> dict[str, str]:
     leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {jax.tree_util.keystr(path): f"{x.dtype}{list(x.shape)}" for path, x in leaves}
 
@@ -180,7 +181,7 @@ def _check_leaves(path: pathlib.Path, saved: dict[str, str], expected: dict[str,
             )
 
 
-def _abstract(leaf: Any) -> jax.ShapeDtypeStruct:
+def _abstract(leaf: jax.Array | jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=leaf.sharding)
 
 

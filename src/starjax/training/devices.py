@@ -8,6 +8,7 @@ import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from starjax.core import errors
+from starjax.core.types import Tree
 from starjax.runtime import processes, xla
 
 AXIS = "batch"
@@ -65,7 +66,7 @@ def compiler_options(mesh: Mesh) -> dict[str, Any]:
     return _OVERLAP if mesh.size > 1 and platform == "gpu" else {}
 
 
-def replicate(tree: Any, mesh: Mesh, may_alias: bool | None = False) -> Any:
+def replicate(tree: Tree, mesh: Mesh, may_alias: bool | None = False) -> Tree:
     """Copies every array to all devices of the mesh, in buffers of its own (safe to donate)."""
     return _put(tree, replicated(mesh), may_alias)
 
@@ -77,19 +78,19 @@ def own_rows(mesh: Mesh, count: int) -> np.ndarray:
     return np.unique(np.concatenate([np.arange(count)[span] for (span,) in spans]))
 
 
-def shard_own(tree: Any, mesh: Mesh, count: int) -> Any:
+def shard_own(tree: Tree, mesh: Mesh, count: int) -> Tree:
     """Splits a batch of `count`, of which every process has its `own_rows`, over the devices."""
     sharding = batch_sharding(mesh)
     if sharding.is_fully_addressable:
         return _put(tree, sharding, None)
 
-    def join(x: Any) -> jax.Array:
+    def join(x: np.ndarray) -> jax.Array:
         return jax.make_array_from_process_local_data(sharding, x, (count, *x.shape[1:]))
 
     return jax.tree.map(join, tree)
 
 
-def _put(tree: Any, sharding: NamedSharding, may_alias: bool | None) -> Any:
+def _put(tree: Tree, sharding: NamedSharding, may_alias: bool | None) -> Tree:
     if sharding.is_fully_addressable:
         return jax.device_put(tree, sharding, may_alias=may_alias)
     return jax.tree.map(lambda x: processes.spread(x, sharding, may_alias), tree)

@@ -17,6 +17,7 @@ import jax
 import numpy as np
 
 from starjax.core import config
+from starjax.core.types import Array, ArrayTree
 from starjax.data import redraw
 from starjax.policies import features as inputs
 from starjax.policies import generator
@@ -119,7 +120,7 @@ def _computed(
     return parts
 
 
-def precompile(encoder: Encoder, policy_config: config.PolicyConfig, frames: Any) -> None:
+def precompile(encoder: Encoder, policy_config: config.PolicyConfig, frames: Array) -> None:
     """Compiles, in the background, the program of `features`, for batches of this shape."""
     _see_program(policy_config).prepare(encoder.params, frames)
 
@@ -129,7 +130,7 @@ def _see_program(policy_config: config.PolicyConfig) -> Program:
     """Returns the program of parameters and frames `[B, h, w, 3]` uint8 -> features `[B, d_v]`."""
     vision = generator.vision_encoder(policy_config)
 
-    def see(params: Any, frames: jax.Array) -> Any:
+    def see(params: ArrayTree, frames: jax.Array) -> Any:
         return vision.apply(params, inputs.centre_crop(policy_config, frames))
 
     return Program(see)

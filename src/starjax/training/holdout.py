@@ -1,7 +1,6 @@
 """Action error on demonstrations kept out of training: open loop, against their commands."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +8,10 @@ import numpy as np
 
 from starjax import rcm
 from starjax.core import config
+from starjax.core.types import Array, Command
 from starjax.data import windows
-from starjax.policies.base import Policy
+from starjax.data.normalizer import Normalizer
+from starjax.policies.base import Params, Policy
 from starjax.runtime.precompile import Program
 from starjax.training.state import TrainState
 
@@ -40,14 +41,14 @@ def make(
     count = min(_WINDOWS, len(frames))
     chosen = frames[(np.arange(count) * len(frames)) // count]  # evenly over the demonstrations
 
-    def gather(data: windows.Dataset, frame: Any) -> windows.Batch:
+    def gather(data: windows.Dataset, frame: windows.Array) -> windows.Batch:
         return windows.gather(data, frame, policy_config.obs_horizon, policy_config.horizon)
 
     batch = (jax.jit(gather) if windows.on_device(dataset) else gather)(dataset, chosen)
     # the same noise each time: the curve shows the network and not the draw
     keys = jax.random.split(jax.random.key(0), count)
 
-    def errors(params: Any, stats: Any, batch: windows.Batch) -> dict[str, jax.Array]:
+    def errors(params: Params, stats: Normalizer, batch: windows.Batch) -> dict[str, jax.Array]:
         predicted = policy.sample(params, stats, keys, batch.observation, batch.trocar)
         p_world_trocar = batch.trocar.p_world_trocar[:, None]
         return action_errors(predicted, batch.command, p_world_trocar, wrist)
@@ -64,7 +65,10 @@ def make(
 
 
 def action_errors(
-    predicted: Any, demonstrated: Any, p_world_trocar: Any, wrist: rcm.Wrist | None = None
+    predicted: Command,
+    demonstrated: Command,
+    p_world_trocar: Array,
+    wrist: rcm.Wrist | None = None,
 ) -> dict[str, jax.Array]:
     """Returns mean errors of commands `[..., A]`: tip in mm, roll in degrees, gripper, RCM in mm.
 
@@ -94,7 +98,7 @@ def action_errors(
     }
 
 
-def _shaft(wrist: rcm.Wrist, command: Any, p_world_trocar: Any) -> rcm.Pose:
+def _shaft(wrist: rcm.Wrist, command: Command, p_world_trocar: Array) -> rcm.Pose:
     """Returns the shaft of a command; without recorded angles it passes through the trocar."""
     angles = command.wrist
     if angles is None:

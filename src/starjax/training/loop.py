@@ -235,6 +235,11 @@ def _train(
     return TrainingResult(whole, pace.samples_per_second, int(whole.skipped), held_out_errors)
 
 
+@functools.cache
+def _learning_rate(train_config: config.TrainConfig) -> precompile.Program:
+    return precompile.Program(states.learning_rate(train_config))
+
+
 def _log(
     path: pathlib.Path, step: int, carry: StepCarry, train_config: config.TrainConfig
 ) -> tuple[StepCarry, str]:
@@ -243,8 +248,8 @@ def _log(
     values = states.mean_metrics(state.sums, step, skipped, train_config)
     here = values.pop("skipped")
     # The optimiser counts from 0 and sees no skipped step.
-    rate = states.learning_rate(train_config)(step - 1 - skipped)
-    values |= {"learning_rate": float(jnp.asarray(rate)), "skipped": here}
+    rate = _learning_rate(train_config)(np.int32(step - 1 - skipped))
+    values |= {"learning_rate": float(rate), "skipped": here}
     if processes.is_first():
         log.append(path, step, "train", values)
     note = f"loss {values['loss']:.4f}" if "loss" in values else "no finite loss"

@@ -15,6 +15,7 @@ import numpy as np
 
 from starjax.core import errors
 from starjax.core.types import Pose
+from starjax.data import windows
 from starjax.runtime.precompile import Program
 from starjax.sim.state import ImageSource
 from starjax.training import batches, devices, randomise
@@ -87,7 +88,7 @@ def draw_images(
     count: int,
     key: jax.Array,
     first: jax.Array,
-    dataset: Any,
+    dataset: windows.Dataset,
     frames: jax.Array,
     available: jax.Array,
 ) -> dict[str, jax.Array]:

@@ -15,6 +15,7 @@ import optax
 from jax.sharding import Mesh
 
 from starjax.core import config
+from starjax.core.types import ArrayTree, Tree
 from starjax.policies.base import Params, Policy
 from starjax.policies.models import kernels
 from starjax.training import devices
@@ -87,7 +88,7 @@ class StateLayout(NamedTuple):
         """Returns shapes and shardings of a carry."""
         shardings = {True: devices.batch_sharding(self.mesh), False: devices.replicated(self.mesh)}
 
-        def one(path: tuple[Any, ...], x: Any) -> jax.ShapeDtypeStruct:
+        def one(path: tuple[Any, ...], x: jax.Array | jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
             shared_out = self._is_shared_out(path, x)
             shape = (x.size,) if shared_out else x.shape
             return jax.ShapeDtypeStruct(shape, x.dtype, sharding=shardings[shared_out])
@@ -118,7 +119,7 @@ class StateLayout(NamedTuple):
         """Returns the networks' parameters with rounded matrices, shared out as the carry."""
         return kernels.unpacked(_replaced(carry.state.params, carry.rounded))
 
-    def rounded(self, params: Any) -> Any:
+    def rounded(self, params: ArrayTree) -> Any:
         """Returns a carry's matrices in the networks' type, None for other leaves."""
         types = self._packed_shapes(jax.eval_shape(self.round, self.whole.params))
         leaves, tree = jax.tree.flatten(params)
@@ -139,7 +140,7 @@ class StateLayout(NamedTuple):
             self.whole.params,
         )
 
-    def mean(self, tree: Any) -> Any:
+    def mean(self, tree: Tree) -> Tree:
         """Returns the mean of every device's numbers."""
         return tree if self.mesh.size == 1 else jax.lax.pmean(tree, devices.AXIS)
 
@@ -158,7 +159,7 @@ class StateLayout(NamedTuple):
         summed = jax.tree.map(lambda g, like: g.astype(like.dtype), summed, shapes)  # float32 again
         return jax.tree.map(lambda g: g / count, summed) if count > 1 else summed  # sum -> mean
 
-    def norm(self, gradients: Any) -> jax.Array:
+    def norm(self, gradients: ArrayTree) -> jax.Array:
         """Returns the Euclidean norm of all gradients."""
         leaves = jax.tree.leaves(gradients)
         if self.mesh.size == 1:
@@ -176,7 +177,7 @@ class StateLayout(NamedTuple):
         """Returns shapes of the state, or of its parameters, packed but not shared out."""
         return jax.eval_shape(self._packed, shapes)
 
-    def _is_shared_out(self, path: tuple[Any, ...], x: Any) -> bool:
+    def _is_shared_out(self, path: tuple[Any, ...], x: jax.Array | jax.ShapeDtypeStruct) -> bool:
         """Returns whether a leaf is shared out: a large matrix outside the image encoders.
 
         They are used first, and their gradients known last: nothing could run meanwhile.
@@ -213,7 +214,7 @@ def _rounded(leaves: list[jax.Array], types: tuple[Any, ...]) -> list[jax.Array 
     return [None if x.dtype == dtype else x.astype(dtype) for x, dtype in pairs]
 
 
-def _replaced(tree: Any, some: Any) -> Any:
+def _replaced(tree: Tree, some: Tree) -> Tree:
     """Returns `tree` with the leaves of `some` that are not None."""
     return jax.tree.map(
         lambda one, leaf: leaf if one is None else one, some, tree, is_leaf=lambda x: x is None

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import optax
 
 from starjax.core import config, errors
+from starjax.core.types import ArrayTree
 from starjax.data import normalizer
 from starjax.policies.base import Params, Policy
 from starjax.runtime.precompile import Program
@@ -102,7 +103,7 @@ def make_optimizer(train_config: config.TrainConfig) -> optax.GradientTransforma
     return optax.chain(*parts, optax.scale_by_learning_rate(learning_rate(train_config)))
 
 
-def _are_of_roll(params: Any) -> Any:
+def _are_of_roll(params: ArrayTree) -> Any:
     """Tells which leaves are kernels of the roll network, packed or not."""
 
     def is_one(path: tuple[Any, ...], _: Any) -> bool:

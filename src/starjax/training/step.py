@@ -10,6 +10,7 @@ import numpy as np
 import optax
 
 from starjax.core import config
+from starjax.core.types import Tree
 from starjax.data import windows
 from starjax.rcm import arrays
 from starjax.runtime.precompile import Program
@@ -67,7 +68,7 @@ def train_step(setup: Setup, carry: StepCarry, batch: windows.Batch) -> StepCarr
     return setup.layout.on_each_device(update)(carry, prepared)
 
 
-def _update(setup: Setup, carry: StepCarry, prepared: Any) -> StepCarry:
+def _update(setup: Setup, carry: StepCarry, prepared: windows.Batch) -> StepCarry:
     """Takes one step on a device's share of a prepared batch."""
     layout, state = setup.layout, carry.state
     # 1. Gradient of the batch, whose shares the devices average.
@@ -91,7 +92,7 @@ def _update(setup: Setup, carry: StepCarry, prepared: Any) -> StepCarry:
     metrics["gradient_norm"] = norm
     sums = states.add_metrics(state.sums, metrics, finite)
 
-    def keep(new: Any, old: Any) -> Any:
+    def keep(new: Tree, old: Tree) -> Tree:
         # Selected leaf by leaf, without a branch: a condition would copy the whole state.
         return jax.tree.map(functools.partial(jax.lax.select, finite), new, old)
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from starjax.core.types import ArrayTree
 from starjax.policies.models import layers
 from starjax.sim.state import Env, EnvState
 
@@ -87,7 +88,7 @@ def values(critic: Critic, seen: jax.Array) -> jax.Array:
 def step(critic: Critic, seen: jax.Array, returns: jax.Array) -> Critic:
     """Takes one step of the squared error between values of `seen` `[B, K]` and `returns` `[B]`."""
 
-    def loss(params: Any) -> jax.Array:
+    def loss(params: ArrayTree) -> jax.Array:
         return jnp.mean((values(critic._replace(params=params), seen) - returns) ** 2)
 
     change, optimizer = _ADAM.update(jax.grad(loss)(critic.params), critic.optimizer)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from starjax import rcm
 from starjax.addons.finetune import critic
-from starjax.core.types import Observation
+from starjax.core.types import ArrayTree, Observation
 from starjax.policies.base import Policy
 from starjax.rcm.trocar import Trocar
 from starjax.runtime import precompile
@@ -101,7 +101,7 @@ def make(
         key = jax.random.fold_in(jax.random.fold_in(key, starts.index), starts.trial)
         return env.reset(key, sim_env.EnvParams(starts.trocar))
 
-    def look(vision: Any, past: Any) -> Observation:
+    def look(vision: ArrayTree, past: ArrayTree) -> Observation:
         """Observes states `[O, N]`; returns leaves `[N, O, ...]`."""
 
         def one(state: EnvState) -> Observation:

@@ -15,6 +15,7 @@ from jax.typing import ArrayLike
 
 from starjax.addons.finetune import advantages, critic
 from starjax.addons.finetune.explore import Experience, ExploreSettings
+from starjax.core.types import ArrayTree
 from starjax.data import windows
 from starjax.policies.base import Params, Policy
 from starjax.runtime import precompile
@@ -131,7 +132,7 @@ def make(
         flat = jax.tree.map(lambda x: x.reshape(count * decisions, *x.shape[2:]), parts)
         return (*flat, trocar)
 
-    def mean_of(params: Any, stats: Any, row: tuple[Any, ...]) -> jax.Array:
+    def mean_of(params: optax.Params, stats: Any, row: tuple[Any, ...]) -> jax.Array:
         observation, keys, action, trocar = row
         return generate(params, stats, keys, observation, trocar)[:, : action.shape[1]]
 
@@ -220,5 +221,5 @@ def make(
     return precompile.Program(learn)
 
 
-def _taken(tree: Any, index: jax.Array) -> Any:
+def _taken(tree: ArrayTree, index: jax.Array) -> Any:
     return jax.tree.map(lambda leaf: leaf[index], tree)

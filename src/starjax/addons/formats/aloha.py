@@ -11,13 +11,16 @@ import io
 import re
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
 
 from starjax.addons.formats import base, per_file, robomimic
 from starjax.addons.formats.base import Column, Source
+
+if TYPE_CHECKING:  # for annotations alone
+    import h5py
 
 _FILE = re.compile(r"episode_\d+\.(hdf5|h5)")
 _IMAGES = "observations/images/"
@@ -39,7 +42,7 @@ def _read(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
         return {name: _array(data, name) for name in names if name in data}
 
 
-def _columns(data: Any, length: int) -> dict[str, Column]:
+def _columns(data: "h5py.Group", length: int) -> dict[str, Column]:
     columns = {}
     for name, dataset in robomimic.datasets(data).items():
         if dataset.shape[:1] != (length,):
@@ -51,20 +54,20 @@ def _columns(data: Any, length: int) -> dict[str, Column]:
     return columns
 
 
-def _array(data: Any, name: str) -> np.ndarray:
+def _array(data: "h5py.Dataset", name: str) -> np.ndarray:
     dataset = data[name]
     base.require_fits(name, dataset.shape, dataset.dtype)
     rows = dataset[()]
     return np.stack([_picture(row) for row in rows]) if _is_packed(name, dataset) else rows
 
 
-def _is_packed(name: str, dataset: Any) -> bool:
+def _is_packed(name: str, dataset: "h5py.Dataset") -> bool:
     """Returns True for images as a JPEG or PNG per step."""
     is_bytes = dataset.dtype == np.uint8 and dataset.ndim == 2
     return name.startswith(_IMAGES) and (is_bytes or dataset.dtype.kind == "O")
 
 
-def _picture(row: Any) -> np.ndarray:
+def _picture(row: np.ndarray) -> np.ndarray:
     data = np.asarray(row, np.uint8).tobytes()
     with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
         base.require_fits("an image", (image.height, image.width, 3), np.uint8)

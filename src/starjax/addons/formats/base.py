@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from starjax.core import errors
 from starjax.core.registry import Registry
@@ -260,7 +261,7 @@ def require_inside(root: Path, path: Path) -> Path:
     return path
 
 
-def require_fits(name: str, shape: Sequence[int], dtype: Any) -> None:
+def require_fits(name: str, shape: Sequence[int], dtype: DTypeLike) -> None:
     """Raises Damaged for an array whose header claims more than this machine's memory."""
     count = math.prod(shape) * np.dtype(dtype).itemsize
     max_count = MEMORY_SHARE * xla.memory_bytes()

@@ -9,6 +9,7 @@ from the tip's pose through the measured trocar. Trials are those
 of an evaluation: commands are executed as they are, without the ranges of `ranges.actions`.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -17,6 +18,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
+from jax.typing import ArrayLike
 
 from starjax import rcm
 from starjax.core import errors
@@ -69,14 +71,19 @@ class ExportedVectorEnv(vector.TaskVectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
 
     def reset(
-        self, *, seed: Any = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
         """Begins episodes, see `TaskVectorEnv.reset`."""
         mask = (options or {}).get("reset_mask")
         observed, info = super().reset(seed=seed, options=options)
         return self._columns(observed, mask), info
 
-    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(
+        self, actions: ArrayLike
+    ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advances every lane by one control step (1/30 s), to actions in the export's columns.
 
         Raises:

@@ -80,7 +80,7 @@ class _Numbers:
         self.high = float(np.max(values, initial=self.high, where=is_finite))
 
 
-def _said(column: Any, numbers: _Numbers | None) -> str:
+def _said(column: base.Column, numbers: _Numbers | None) -> str:
     text = f"{column.dtype} {list(column.shape)}  {', '.join(column.names[:16])}"
     is_flag = not column.shape and column.dtype == "bool"
     if numbers is None or is_flag or numbers.low > numbers.high:
@@ -106,7 +106,7 @@ def mapped(path: Path, map_name: str) -> tuple[list[Any], list[str]]:
             return recorded.recordings(source, columns, file.parent, advance)
 
 
-def _format(form: Any) -> str:
+def _format(form: base.Format) -> str:
     return form.description
 
 

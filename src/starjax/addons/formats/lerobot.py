@@ -17,7 +17,7 @@ import math
 import re
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -28,6 +28,9 @@ from starjax.addons.formats import base, lerobot_meta, lerobot_write, video
 from starjax.addons.formats.base import Column, Source
 from starjax.rollouts import episodes
 from starjax.runtime import files
+
+if TYPE_CHECKING:  # for annotations alone
+    from pyarrow import parquet as pq
 
 _NAMES = {
     "state": "observation.state",
@@ -225,7 +228,7 @@ def _rows(root: Path, place: _Place, columns: dict[str, Column]) -> Any:
     return pa.Table.from_batches(batches).sort_by(order)
 
 
-def _may_hold(group: Any, columns: dict[str, Column], number: int) -> bool:
+def _may_hold(group: "pq.RowGroupMetaData", columns: dict[str, Column], number: int) -> bool:
     """Returns False for a row group without rows of the episode, by its statistics.
 
     Raises:
@@ -244,7 +247,7 @@ def _may_hold(group: Any, columns: dict[str, Column], number: int) -> bool:
     return holds
 
 
-def _array(name: str, cells: Any, column: Column, kind: str, length: int) -> np.ndarray:
+def _array(name: str, cells: pa.ChunkedArray, column: Column, kind: str, length: int) -> np.ndarray:
     base.require(len(cells) == length, f"{length} rows of {name}", len(cells))
     base.require(cells.null_count == 0, f"no empty cells in {name}", cells.null_count)
     if kind == "image":

@@ -12,7 +12,7 @@ import json
 import re
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import h5py
 import numpy as np
@@ -20,6 +20,9 @@ import numpy as np
 from starjax.addons.formats import base, per_file
 from starjax.addons.formats.base import Column, Source
 from starjax.rollouts import episodes
+
+if TYPE_CHECKING:  # for annotations alone
+    import h5py
 
 SUFFIXES = (".hdf5", ".h5")
 _NAMES = {
@@ -129,7 +132,7 @@ def _refuse_links(file: h5py.File) -> None:
     """Refuses files that lead out of themselves, in circles, or many ways to the same place."""
     addresses = set()
 
-    def look(group: Any, depth: int) -> None:
+    def look(group: "h5py.Group", depth: int) -> None:
         base.require(depth <= _MAX_DEPTH, f"at most {_MAX_DEPTH} groups deep", group.name)
         address = h5py.h5o.get_info(group.id).addr
         # With sixty names a group, six deep, a file of 100 kB has more paths than can be walked.
@@ -149,7 +152,7 @@ def _refuse_links(file: h5py.File) -> None:
     look(file, 0)
 
 
-def datasets(group: Any) -> dict[str, Any]:
+def datasets(group: "h5py.Group") -> dict[str, Any]:
     """Returns the datasets of a group by their paths."""
     found = {}
     group.visititems(lambda name, item: found.update({name: item} if _is_data(item) else {}))
@@ -160,7 +163,7 @@ def _is_data(item: Any) -> bool:
     return isinstance(item, h5py.Dataset) and item.shape is not None
 
 
-def episode_length(demo: Any) -> int:
+def episode_length(demo: "h5py.Group") -> int:
     """Returns the control steps of an episode: those of its actions, or the most common length."""
     base.require(isinstance(demo, h5py.Group), "a group an episode", f"a dataset {demo.name}")
     name = next((name for name in ("actions", "action") if name in demo), None)
@@ -185,7 +188,7 @@ def _attribute(data: Any, name: str) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def _names(data: Any, name: str, dataset: Any) -> tuple[str, ...]:
+def _names(data: "h5py.Group", name: str, dataset: h5py.Dataset) -> tuple[str, ...]:
     return base.names_in(_attribute(data, "names"), name, dataset.shape[1:])
 
 

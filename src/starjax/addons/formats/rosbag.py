@@ -16,13 +16,16 @@ import functools
 import tempfile
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starjax.addons.formats import base, per_file, ros_messages, timing
 from starjax.addons.formats.base import Column, Source, StepTimes
 from starjax.core import extras
+
+if TYPE_CHECKING:  # for annotations alone
+    from rosbags.highlevel import AnyReader
 
 _SUFFIXES = (".mcap", ".db3", ".bag")
 _META = "metadata.yaml"  # for a folder that is a rosbag2
@@ -151,7 +154,7 @@ def _clock(columns: dict[str, Column], counts: dict[int, dict[str, int]]) -> str
     return max(poses or names, key=lambda name: first.get(name, 0))
 
 
-def _messages(reader: Any, name: str) -> Iterator[tuple[Any, int]]:
+def _messages(reader: "AnyReader", name: str) -> Iterator[tuple[Any, int]]:
     """Yields the messages of a topic, with the ns of their recording."""
     connections = [c for c in reader.connections if _name(c.topic) == name]
     base.require(bool(connections), f"a topic {name}", "none")
@@ -159,7 +162,7 @@ def _messages(reader: Any, name: str) -> Iterator[tuple[Any, int]]:
         yield reader.deserialize(raw, connection.msgtype), logged
 
 
-def _stream(reader: Any, name: str) -> timing.Stream:
+def _stream(reader: "AnyReader", name: str) -> timing.Stream:
     times = [
         (ros_messages.seconds(m, logged), 1e-9 * logged) for m, logged in _messages(reader, name)
     ]
@@ -167,7 +170,7 @@ def _stream(reader: Any, name: str) -> timing.Stream:
     return timing.Stream(*np.array(times).T)
 
 
-def _values(reader: Any, name: str, column: Column) -> np.ndarray:
+def _values(reader: "AnyReader", name: str, column: Column) -> np.ndarray:
     """Returns values `[N, ...]` of a topic in the order of the log."""
     count = sum(c.msgcount for c in reader.connections if _name(c.topic) == name)
     base.require_fits(name, (count, *column.shape), column.dtype)

@@ -75,7 +75,7 @@ def read(path: Path, first: float, length: int, hz: float, shape: tuple[int, ...
     return frames
 
 
-def _frames(file: Any, first: float) -> Iterator[tuple[float, Any]]:
+def _frames(file: "av.container.InputContainer", first: float) -> Iterator[tuple[float, Any]]:
     stream = file.streams.video[0]
     stream.thread_type = "AUTO"
     if first > 0.0:
@@ -86,7 +86,7 @@ def _frames(file: Any, first: float) -> Iterator[tuple[float, Any]]:
         yield float(frame.pts * frame.time_base), colours.pull()
 
 
-def _colours(stream: Any) -> Any:
+def _colours(stream: "av.VideoStream") -> Any:
     """Builds the filter graph from a stream's frames to RGB."""
     graph = av.filter.Graph()
     scale = graph.add("scale", _ROUNDED), graph.add("format", "rgb24")

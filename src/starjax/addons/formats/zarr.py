@@ -126,7 +126,7 @@ def _write(path: Path, source: Source, video: bool) -> None:
 class _Buffer:
     """Appends to an array in whole chunks, which never reads a chunk back."""
 
-    def __init__(self, array: Any):
+    def __init__(self, array: zarr.Array):
         self._array, self._parts, self._held, self._at = array, [], 0, 0
 
     def append(self, part: np.ndarray) -> None:
@@ -154,7 +154,7 @@ def _array(storage: Any, name: str) -> Any:
     return zarr.open_array(storage, path=name, mode="r")
 
 
-def _require_readable(name: str, array: Any, shape: Sequence[int]) -> None:
+def _require_readable(name: str, array: zarr.Array, shape: Sequence[int]) -> None:
     """Raises Damaged for sizes that a damaged header claims, in numbers or in chunks."""
     base.require(min(array.chunks, default=1) > 0, f"chunks of {name}", list(array.chunks))
     base.require_fits(name, shape, array.dtype)

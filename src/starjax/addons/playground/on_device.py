@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector import AutoresetMode
+from jax.typing import ArrayLike
 
 from starjax.core import errors
 from starjax.envs import batch, vector
@@ -48,7 +49,7 @@ class TaskDeviceEnv(vector.TaskVectorEnv):
         super().__init__(num_envs, **arguments)
         self._ended: Any = jnp.zeros(num_envs, bool)
 
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+    def step(self, actions: ArrayLike) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Advances every lane by one control step (1/30 s).
 
         Args:

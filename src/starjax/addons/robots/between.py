@@ -2,11 +2,11 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from starjax import rcm
 from starjax.core.types import Command, Pose
@@ -28,7 +28,7 @@ def of(wrist: rcm.Wrist | None, steps: int) -> Callable[..., list[Command]]:
     def poses(last: Pose, target: Pose, p_world_trocar: jax.Array) -> Pose:
         _, move, turn = toward(last, target, p_world_trocar, jnp.inf, jnp.inf)
 
-        def part(fraction: Any) -> Pose:
+        def part(fraction: ArrayLike) -> Pose:
             most = (jnp.where(x > _STILL, fraction * x, jnp.inf) for x in (move, turn))
             return toward(last, target, p_world_trocar, *most)[0]
 

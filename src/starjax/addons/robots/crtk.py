@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from jax.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from starjax import rcm
@@ -169,7 +170,7 @@ def joints_of(message: Any, names: Sequence[str]) -> np.ndarray:
     return _finite("measured_js.position", [positions[name] for name in names])
 
 
-def fill_joints(message: Any, q: Any, names: Sequence[str]) -> Any:
+def fill_joints(message: Any, q: ArrayLike, names: Sequence[str]) -> Any:
     """Fills `servo_jp`, a JointState, with positions `[J]` (rad, m), and returns it.
 
     Raises:
@@ -218,7 +219,7 @@ def _range(jaw: Jaw) -> float:
     return jaw.open - jaw.closed
 
 
-def _finite(argument: str, values: Any) -> np.ndarray:
+def _finite(argument: str, values: ArrayLike | list[float]) -> np.ndarray:
     values = np.asarray(values, np.float64)
     if not np.isfinite(values).all():
         raise UsageError(argument, "finite values", values.tolist())

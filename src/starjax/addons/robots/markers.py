@@ -7,7 +7,6 @@ All are in the frame of the policy's world.
 # cyclonedds declares sequences by a type of its own, and takes lists and bytes.
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from cyclonedds.idl import IdlStruct
@@ -94,8 +93,8 @@ class MarkerArray(IdlStruct, typename="visualization_msgs::msg::dds_::MarkerArra
 
 def of(
     header: Header,
-    trocar: Any,
-    tip: Any,
+    trocar: np.ndarray,
+    tip: np.ndarray,
     plan: np.ndarray,
     rcm_error: float,
     text: str,

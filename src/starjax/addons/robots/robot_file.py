@@ -190,7 +190,7 @@ def text(robot: RobotFile) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _table(path: Any, name: str, kind: Any, values: Any) -> Any:
+def _table(path: str | Path, name: str, kind: type, values: Any) -> Any:
     """Returns a table as its record, every value of the record's type."""
     fields = {field.name: field for field in dataclasses.fields(kind)}
     if not isinstance(values, dict):
@@ -212,7 +212,7 @@ def _table(path: Any, name: str, kind: Any, values: Any) -> Any:
     return kind(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
 
 
-def _check(path: Any, robot: RobotFile) -> None:
+def _check(path: str | Path, robot: RobotFile) -> None:
     from starjax.sim import registries
 
     arm, place = robot.arm, robot.trocar.position

@@ -12,6 +12,7 @@ from starjax.core.types import Command, Pose
 from starjax.rcm.trocar import Trocar
 from starjax.runtime.precompile import Program
 from starjax.sim import env as sim_env
+from starjax.sim.state import EnvState
 
 PERIODS = round(sim_arm.RATE / sim_env.CONTROL_HZ)  # topics' periods in a control period
 
@@ -107,11 +108,11 @@ class SceneBody:
     def _measured(self) -> np.ndarray:
         return np.asarray(self.state.physics.qpos[self._bound.q], np.float64)
 
-    def _advanced(self, state: Any, command: Command) -> Any:
+    def _advanced(self, state: EnvState, command: Command) -> Any:
         """Computes a control period, also after a success, and the images."""
         going = state.replace(done=jnp.zeros((), bool))
         after = self.env.step(going, command)
         return after, self._seen(after)
 
-    def _seen(self, state: Any) -> dict[str, jax.Array]:
+    def _seen(self, state: EnvState) -> dict[str, jax.Array]:
         return {name: image.rgb for name, image in self.env.camera(state).items()}

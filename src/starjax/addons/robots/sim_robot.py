@@ -3,11 +3,15 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from starjax.cli import checks, options
 from starjax.core.limits import Positive, Range
 from starjax.runtime import jax_start, signals, xla
+
+if TYPE_CHECKING:  # for annotations alone
+    from starjax.addons.robots.scene_body import SceneBody
+    from starjax.addons.robots.sim_arm import Kinematic
 
 DESCRIPTION = """Serves a simulated arm on CRTK's topics over DDS, as ROS 2 has them.
 
@@ -87,7 +91,7 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def _file_of(args: SimRobotArgs, body: Any, network: Any) -> Any:
+def _file_of(args: SimRobotArgs, body: "SceneBody | Kinematic", network: Any) -> Any:
     """Returns the file of `starjax robot` for a scene: its base, trocar and cameras, full speed."""
     from scipy.spatial.transform import Rotation
 

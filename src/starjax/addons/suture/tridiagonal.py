@@ -5,6 +5,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+Row = tuple[jax.Array, ...]
+
 
 def solve(a: jax.Array, b: jax.Array, c: jax.Array, d: jax.Array) -> jax.Array:
     """Solves a_i x_(i-1) + b_i x_i + c_i x_(i+1) = d_i, all `[N]`, a_0 = c_(N-1) = 0.
@@ -18,7 +20,7 @@ def solve(a: jax.Array, b: jax.Array, c: jax.Array, d: jax.Array) -> jax.Array:
 def in_turn(a: jax.Array, b: jax.Array, c: jax.Array, d: jax.Array) -> jax.Array:
     """Solves a tridiagonal system by elimination from the first equation to the last."""
 
-    def eliminate(above: Any, row: Any) -> Any:
+    def eliminate(above: Row, row: Row) -> Any:
         (c_above, d_above), (a, b, c, d) = above, row
         scale = 1.0 / (b - a * c_above)
         below = c * scale, (d - a * d_above) * scale
@@ -27,7 +29,7 @@ def in_turn(a: jax.Array, b: jax.Array, c: jax.Array, d: jax.Array) -> jax.Array
     zero = jnp.zeros_like(d[0])
     _, rows = jax.lax.scan(eliminate, (zero, zero), (a, b, c, d))
 
-    def insert(x: jax.Array, row: Any) -> tuple[jax.Array, jax.Array]:
+    def insert(x: jax.Array, row: Row) -> tuple[jax.Array, jax.Array]:
         x = row[1] - row[0] * x
         return x, x
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax.sim import env as sim_env
+from starjax.sim.state import EnvState
 
 
 def make(env: sim_env.Env) -> Callable[[Any], dict[str, float]]:
@@ -22,13 +23,13 @@ def make(env: sim_env.Env) -> Callable[[Any], dict[str, float]]:
     }
 
     @jax.jit
-    def distances(state: Any) -> jax.Array:
+    def distances(state: EnvState) -> jax.Array:
         one = jax.tree.map(lambda x: x[0], state)
         values = task.state(env.scene.bound, one.layout, one.measurements)
         p = jnp.stack([values[first : first + 3] for first in points.values()])
         return jnp.linalg.norm(p[:, None] - one.pose.p, axis=-1).min(axis=-1)
 
-    def in_mm(state: Any) -> dict[str, float]:
+    def in_mm(state: EnvState) -> dict[str, float]:
         if not points:
             return {}
         return dict(zip(points, (1e3 * np.asarray(distances(state))).tolist()))

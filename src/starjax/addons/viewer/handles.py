@@ -1,12 +1,15 @@
 """Arrows in the 3D view that drag the trocars, limited to the reach of the arms."""
 
 import time
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starjax.sim import registries, trocar_region
 from starjax.sim.task import Slot, Task
+
+if TYPE_CHECKING:  # for annotations alone
+    import viser
 
 _SCALE = 0.055  # m, length of the arrows
 RELEASE_S = 0.4  # time without a move after which a handle counts as released
@@ -15,7 +18,7 @@ RELEASE_S = 0.4  # time without a move after which a handle counts as released
 class TrocarHandles:
     """The handles of a task's trocars, one per arm."""
 
-    def __init__(self, scene: Any, task: Task):
+    def __init__(self, scene: "viser.SceneApi", task: Task):
         self._slots = task.slots
         self._handles = [
             scene.add_transform_controls(

@@ -7,6 +7,7 @@ import socket
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+import websockets
 from websockets.asyncio import server as sockets
 
 from starjax.runtime import connections
@@ -15,7 +16,7 @@ MAX_PAGES = 64  # connections to a page, several per tab
 _SCHEMES = ("http", "https")
 
 
-def refusal(request: Any, names: Sequence[str] = ()) -> str:
+def refusal(request: websockets.Request, names: Sequence[str] = ()) -> str:
     """Returns why a request comes from a foreign page, empty for the own page and for programs.
 
     A browser sends the origin of the page that connects. The server's own page has the host of the
@@ -54,7 +55,7 @@ def only(
     original = sockets.serve
 
     def serve(*args: Any, process_request: Any = None, **options: Any) -> Any:
-        def admit(connection: Any, request: Any) -> Any:
+        def admit(connection: sockets.ServerConnection, request: websockets.Request) -> Any:
             if why := refusal(request, names):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, f"{why}\n")
             response = process_request(connection, request) if process_request else None

@@ -1,11 +1,14 @@
 """Choices of the live view: task, agents, robot and trocar."""
 
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from starjax.addons.viewer import page, simulation
 from starjax.addons.viewer.simulation import AgentSpec
 from starjax.addons.viewer.success_map import SuccessMap
 from starjax.sim import registries
+
+if TYPE_CHECKING:  # for annotations alone
+    import viser
 
 OWN_ARMS = "their own"
 _OWN_TROCAR = "own, as you moved it"
@@ -34,7 +37,7 @@ class ViewOptions(NamedTuple):
 class Selection:
     """Task, agents, robot and trocar that the panel's dropdowns select."""
 
-    def __init__(self, gui: Any, requests: page.UiRequests, options: ViewOptions):
+    def __init__(self, gui: "viser.GuiApi", requests: page.UiRequests, options: ViewOptions):
         self._given = {spec.label: spec for spec in options.agents}
         labels = [spec.label for spec in options.agents]
         task = options.agents[0].task

@@ -22,6 +22,7 @@ from starjax.rollouts import trial_key
 from starjax.runtime.precompile import Program
 from starjax.sim import env as sim_env
 from starjax.sim import moving_trocars, registries
+from starjax.sim.state import EnvState
 
 EXPERT = "expert"
 # m/s at which a trocar follows its handle: tissue yields gradually. The controller keeps the shaft
@@ -166,7 +167,7 @@ def camera(env: sim_env.Env) -> Callable[[Any], dict[str, jax.Array]]:
     """Makes a compiled EnvState `[1]` -> camera's name -> `[h, w, 3]` uint8."""
 
     @Program
-    def look(state: Any) -> dict[str, jax.Array]:
+    def look(state: EnvState) -> dict[str, jax.Array]:
         images = env.camera(jax.tree.map(lambda x: x[0], state))
         return {name: image.rgb for name, image in images.items()}
 

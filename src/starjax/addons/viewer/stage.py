@@ -2,7 +2,7 @@
 
 import collections
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import mujoco
 import numpy as np
@@ -34,7 +34,7 @@ class Stage:
     Each step sends two short messages per mesh, however many geoms share it.
     """
 
-    def __init__(self, scene: Any, model: mujoco.MjModel, i: int = 0):
+    def __init__(self, scene: "viser.SceneApi", model: mujoco.MjModel, i: int = 0):
         root = f"/rollout{i}"
         self._root = scene.add_frame(root, show_axes=False, position=(0.0, _SPACING * i, 0.0))
         self._poses, self._parts = kinematics(model), meshes.read(model)
@@ -133,7 +133,9 @@ def kinematics(m: mujoco.MjModel) -> Callable[..., GeomPoses]:
     return poses
 
 
-def _add_grid(scene: Any, name: str, size: np.ndarray, p: np.ndarray, wxyz: np.ndarray) -> None:
+def _add_grid(
+    scene: "viser.SceneApi", name: str, size: np.ndarray, p: np.ndarray, wxyz: np.ndarray
+) -> None:
     """Adds squares on a plane to show its scale."""
     width, height = (2.0 * float(half) if half > 0 else 1.0 for half in size[:2])
     scene.add_grid(

@@ -1,7 +1,7 @@
 """A sweep's trials in the scene: dots at their trocars above a floor of the local success rate."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -9,6 +9,9 @@ from starjax import rcm
 from starjax.evaluation import rate_map, result
 from starjax.rcm.trocar import Trocar
 from starjax.sim import registries
+
+if TYPE_CHECKING:  # for annotations alone
+    import viser
 
 _SUCCESS_RGB, _FAILURE_RGB = (0, 121, 107), (194, 97, 31)
 _SIZE = 0.0016  # m
@@ -68,7 +71,7 @@ def floor(shown: SuccessMap) -> tuple[np.ndarray, np.ndarray]:
     return np.dstack([rgb, opacity]).round().astype(np.uint8), bounds
 
 
-def add(scene: Any, shown: SuccessMap) -> list[Any]:
+def add(scene: "viser.SceneApi", shown: SuccessMap) -> list[Any]:
     """Adds dots and floor to the scene; returns their handles."""
     arms = shown.p_world_trocar.shape[1]
     colours = np.where(shown.success[:, None], _SUCCESS_RGB, _FAILURE_RGB).astype(np.uint8)

@@ -3,7 +3,7 @@
 import functools
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
@@ -11,6 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from starjax import rcm
 from starjax.addons.viewer.handles import RELEASE_S
+
+if TYPE_CHECKING:  # for annotations alone
+    import viser
 
 # Targets of teleoperation are roll, tip, angles; actions of `rcm6` are roll, angles, tip.
 FROM_RCM6 = np.array([0, 3, 4, 5, 1, 2])
@@ -25,7 +28,7 @@ class TipHandle:
     pose: roll and angles follow from it and the trocar, and arrows keep the rotation.
     """
 
-    def __init__(self, scene: Any, wrist: rcm.Wrist | None = None):
+    def __init__(self, scene: "viser.SceneApi", wrist: rcm.Wrist | None = None):
         self._maps = None if wrist is None else _maps(wrist)
         self._handle = scene.add_transform_controls(
             "/hand", scale=_SIZE, disable_rotations=wrist is None, depth_test=False

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,12 +17,17 @@ from starjax.addons.viewer.success_map import SuccessMap
 from starjax.addons.viewer.trocar_controls import TrocarControls
 from starjax.core import errors
 
+if TYPE_CHECKING:  # for annotations alone
+    import viser
+
+    from starjax.addons.viewer.relief import FixedTrocars
+
 _COMPILING = "Compiling {}\nAbout a minute the first time, seconds later."
 _HAND = "No hand", "starjax view --policy NAME --record DIR lets T pass control to your hand."
 REST_S = 1.5  # pause between an episode and the next trial
 
 
-def run(server: Any, options: ViewOptions, should_stop: Callable[[], bool]) -> str:
+def run(server: "viser.ViserServer", options: ViewOptions, should_stop: Callable[[], bool]) -> str:
     """Shows rollouts until `should_stop()`; returns a summary line."""
     requests = page.UiRequests()
     status = page.Status(server.gui)
@@ -70,12 +75,12 @@ class Rollouts:
 
     def __init__(
         self,
-        server: Any,
+        server: "viser.ViserServer",
         simulations: Sequence[Simulation],
         status: page.Status,
         sweep: SuccessMap | None = None,
         *,
-        trocars: Any = None,
+        trocars: "TrocarControls | FixedTrocars | None" = None,
         is_compiled: bool = False,
     ):
         """Adds them to the page; `trocars` take the place of `TrocarControls`."""
@@ -196,7 +201,7 @@ def _at_own(tally: np.ndarray) -> str:
 
 
 def _load(
-    server: Any, selection: Selection, status: page.Status, sweep: SuccessMap | None
+    server: "viser.ViserServer", selection: Selection, status: page.Status, sweep: SuccessMap | None
 ) -> Rollouts:
     """Loads the selected agents, on their own robots if the selected arm cannot do the task."""
     specs = selection.agents()

@@ -1,11 +1,9 @@
 """Disturbances of time: observations and commands are delayed or lost."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
-from starjax.core.types import Command, Observation
+from starjax.core.types import Command, Observation, Tree
 from starjax.evaluation.disturbances.base import Disturbance, DisturbanceState
 from starjax.sim.state import Env, EnvState
 
@@ -13,7 +11,7 @@ MAX_DELAY = 4  # control steps in memory
 MAX_LOST = 63  # successive lost observations in training; in episodes there may be more
 
 
-def _delayed(disturbance: DisturbanceState, present: Any) -> Any:
+def _delayed(disturbance: DisturbanceState, present: Tree) -> Tree:
     """Returns the value of `level` steps ago; memory `[MAX_DELAY, ...]` has the latest first."""
     steps = jnp.round(disturbance.level).astype(jnp.int32)
     return jax.tree.map(
@@ -21,11 +19,11 @@ def _delayed(disturbance: DisturbanceState, present: Any) -> Any:
     )
 
 
-def _pushed(present: Any, memory: Any) -> Any:
+def _pushed(present: Tree, memory: Tree) -> Tree:
     return jax.tree.map(lambda x, past: jnp.concatenate([x[None], past[:-1]]), present, memory)
 
 
-def _repeated(present: Any) -> Any:
+def _repeated(present: Tree) -> Tree:
     return jax.tree.map(lambda x: jnp.stack([x] * MAX_DELAY), present)
 
 

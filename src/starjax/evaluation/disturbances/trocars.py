@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from starjax import rcm
-from starjax.core.types import Command
+from starjax.core.types import Command, Tree
 from starjax.evaluation.disturbances.base import Disturbance, DisturbanceState
 from starjax.evaluation.disturbances.draws import directions
 from starjax.sim import moving_trocars
@@ -56,7 +56,7 @@ def _breathe(
     return env.step(moved.replace(measured_trocar=measured), command), disturbance.memory
 
 
-def _if_active(disturbance: DisturbanceState, changed: Any, default: Any) -> Any:
+def _if_active(disturbance: DisturbanceState, changed: Tree, default: Tree) -> Tree:
     """Returns `changed` above level 0, else `default`, which other disturbances may have set."""
     return jax.tree.map(lambda x, y: jnp.where(disturbance.level > 0, x, y), changed, default)
 

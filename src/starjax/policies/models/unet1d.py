@@ -16,7 +16,6 @@ latter is computed once for all DDIM steps:
 import itertools
 import math
 from collections.abc import Callable
-from typing import Any
 
 import flax.linen as nn
 import jax
@@ -169,7 +168,9 @@ def _matmul_f32(x: jax.Array, kernel: jax.Array) -> jax.Array:
     return jnp.matmul(x, kernel.astype(x.dtype), preferred_element_type=jnp.float32)
 
 
-def _matmul_f32_gradient(kept: Any, g: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _matmul_f32_gradient(
+    kept: tuple[jax.Array, jax.Array], g: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     x, kernel = kept
     g = g.astype(x.dtype)
     return g @ kernel.astype(x.dtype).T, (x.T @ g).astype(kernel.dtype)

@@ -1,7 +1,5 @@
 """Image of a scene: the nearest face along every ray, the sun's shadow, the colour."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
@@ -64,7 +62,7 @@ def _nearest(
 
 
 def _shaded(
-    scene: scenes.RenderScene, grid: tiles.Grid, R_light_cam: Any, c: Array, R: Array, t: Array,
+    scene: scenes.RenderScene, grid: tiles.Grid, R_light_cam: Array, c: Array, R: Array, t: Array,
     face: Array,
 ) -> Array:  # fmt: skip
     """Returns True for visible points that another geom shades. No convex shape shades itself."""

@@ -6,6 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from starjax.core.types import Array
 from starjax.sim.camera import geometry as scenes
 from starjax.sim.camera import tiles
 
@@ -43,7 +44,7 @@ def _look(texture: scenes.Texture, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def looker(
-    texture: scenes.Texture, step: float, R_world_cam: Any, p_world_cam: Any
+    texture: scenes.Texture, step: float, R_world_cam: Array, p_world_cam: Array
 ) -> Callable[[Sequence[Any]], list[Any]]:
     """Makes a function that evaluates a checker from any pose, filtered over each pixel.
 
@@ -84,10 +85,10 @@ def is_checker(texture: scenes.Texture) -> bool:
     )
 
 
-def _square_wave(u: Any, width: Any) -> Any:
+def _square_wave(u: Array, width: Array) -> Any:
     """Averages, over `width`, the wave of 1 on the first half of each unit and -1 on the other."""
 
-    def integral(x: Any) -> Any:
+    def integral(x: Array) -> Any:
         fraction = x - jnp.floor(x)
         return jnp.where(fraction < 0.5, fraction, 1.0 - fraction)
 

@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
+from starjax.core.types import Array
+
 NAME = "tissue"
 
 # Waves of the relief: direction in rad, length in mm, slope, phase.
@@ -51,7 +53,7 @@ class Look(NamedTuple):
     background: tuple[float, float, float]
 
 
-def look(step: float, R_geom_cam: Any, p_geom_lens: Any) -> Look:
+def look(step: float, R_geom_cam: Array, p_geom_lens: Array) -> Look:
     """Makes the look of one camera over the ground.
 
     Args:
@@ -70,7 +72,7 @@ def look(step: float, R_geom_cam: Any, p_geom_lens: Any) -> Look:
         cone = _smooth((cosine - _CONE) / (1.0 - _CONE))
         return way, jnp.minimum(_BRIGHTEST, (middle * near) ** 2) * (0.25 + 0.75 * cone)
 
-    def paint(p: Sequence[Any], shaded: Any) -> list[Any]:
+    def paint(p: Sequence[Any], shaded: Array) -> list[Any]:
         at = [
             1e3 * (p_geom_lens[k] + sum(R_geom_cam[k, i] * p[i] for i in range(3)))
             for k in range(2)
@@ -90,7 +92,7 @@ def look(step: float, R_geom_cam: Any, p_geom_lens: Any) -> Look:
     return Look(paint, lambda p: from_lamp(p)[1], _CAVITY)
 
 
-def _relief(at: Sequence[Any], footprint: Any) -> tuple[Any, Any, Any]:
+def _relief(at: Sequence[Any], footprint: Array) -> tuple[Any, Any, Any]:
     """Returns slopes along x and y, and a height from -1 to 1, at points in mm."""
     slope_x = slope_y = height = 0.0
     for turn, length, slope, phase in _FOLDS:
@@ -103,7 +105,7 @@ def _relief(at: Sequence[Any], footprint: Any) -> tuple[Any, Any, Any]:
     return slope_x, slope_y, height
 
 
-def _colours(at: Sequence[Any], footprint: Any, height: Any) -> list[Any]:
+def _colours(at: Sequence[Any], footprint: Array, height: Array) -> list[Any]:
     """Returns the unlit RGB at points in mm."""
     deep = 0.5 - 0.5 * height
     fat = _smooth((height - _FAT_FROM) / (_FAT_TO - _FAT_FROM))
@@ -125,7 +127,7 @@ def _colours(at: Sequence[Any], footprint: Any, height: Any) -> list[Any]:
     return rgb
 
 
-def _smooth(x: Any) -> Any:
+def _smooth(x: Array | float) -> Any:
     """Returns the smooth step from 0 at 0 to 1 at 1."""
     x = jnp.clip(x, 0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)

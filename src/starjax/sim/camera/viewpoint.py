@@ -7,10 +7,11 @@ the world's frame, and the pose comes with every image.
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from starjax.core.types import Pose
+from starjax.core.types import Array, Pose
 from starjax.sim.camera import geometry, texture, tiles, tissue
 
 # A texture: visible points x, y, z in the camera frame, `[T, Q]` m each, to red, green and blue.
@@ -61,7 +62,7 @@ def moving(
     grid: tiles.Grid,
     pose_world_cam: Pose,
     look: str = "",
-    has_look: Any = None,
+    has_look: jax.Array | None = None,
 ) -> View:
     """Makes the view from a pose, for a scene read in the world's frame."""
     R_world_cam, p_world_cam = (jnp.asarray(x, jnp.float32) for x in pose_world_cam)
@@ -87,7 +88,11 @@ def moving(
 
 
 def _look(
-    scene: geometry.RenderScene, grid: tiles.Grid, look: str, R_scene_cam: Any, p_scene_cam: Any
+    scene: geometry.RenderScene,
+    grid: tiles.Grid,
+    look: str,
+    R_scene_cam: Array,
+    p_scene_cam: Array,
 ) -> tissue.Look | None:
     """Makes a look of the ground from the camera's pose in the frame of the scene."""
     if not look:

@@ -13,6 +13,7 @@ from starjax.core.limits import Positive, Range
 
 if TYPE_CHECKING:  # for annotations alone
     from starjax.policies.in_env import PolicyInEnv
+    from starjax.policies.monitor.record import Monitor
 
 DESCRIPTION = """Calibrates a runtime monitor and writes the policy with it to a new file.
 
@@ -106,7 +107,7 @@ def _score_settings(args: CalibrateArgs, who: "PolicyInEnv") -> Any:
     return ScoreSettings(execute, control_hz, max(1, round(args.still_s * control_hz / execute)))
 
 
-def _outcome(monitor: Any, figures: dict[str, Any]) -> str:
+def _outcome(monitor: "Monitor", figures: dict[str, Any]) -> str:
     """Returns the thresholds, and the realised false alarm rate with its interval."""
     from starjax.policies.monitor.scores import NAMES
 

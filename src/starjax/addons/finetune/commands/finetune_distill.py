@@ -14,6 +14,8 @@ from starjax.addons.finetune.commands import finetune_stages
 from starjax.addons.finetune.commands.finetune_play import NoisyEpisodes, PolicyParams
 from starjax.addons.finetune.commands.finetune_work import Work
 from starjax.cli import messages, stage_times
+from starjax.core.types import ArrayTree
+from starjax.data import normalizer
 from starjax.policies import policy_file
 from starjax.policies.in_env import PolicyInEnv
 
@@ -68,7 +70,14 @@ class Distillation:
         policy_file.save(file, old._replace(params=params, normalizer=stats, monitor=None))
         return file, {"error": float(error), "success": success}
 
-    def _play(self, number: int, params: Any, vision: Any, stats: Any, key: jax.Array) -> Any:
+    def _play(
+        self,
+        number: int,
+        params: ArrayTree,
+        vision: Any,
+        stats: normalizer.Normalizer,
+        key: jax.Array,
+    ) -> Any:
         """Returns the experience of a policy in a round."""
         key_reset, key_play = jax.random.split(jax.random.fold_in(key, 0))
         draws = np.random.default_rng(number)

@@ -10,7 +10,8 @@ from jax.typing import ArrayLike
 
 from starjax.addons.finetune import dagger, explore, noise_level
 from starjax.addons.finetune.commands.finetune_work import Work
-from starjax.core import errors
+from starjax.core import config, errors
+from starjax.core.types import ArrayTree
 from starjax.evaluation import statistics
 from starjax.policies import features, generator
 from starjax.policies.base import Policy
@@ -85,11 +86,11 @@ class NoisyEpisodes:
         return explore.Starts(fields, index, trial)
 
 
-def _make_see(policy_config: Any) -> explore.See:
+def _make_see(policy_config: config.PolicyConfig) -> explore.See:
     """Returns the encoder on centre crops, as inference sees them."""
     vision = generator.vision_encoder(policy_config)
 
-    def see(params: Any, images: jax.Array) -> jax.Array:
+    def see(params: ArrayTree, images: jax.Array) -> jax.Array:
         return jnp.asarray(vision.apply(params, features.centre_crop(policy_config, images)))
 
     return see

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from starjax.addons.finetune import mixing, noise_level, policy_gradient
+from starjax.addons.finetune import explore, mixing, noise_level, policy_gradient
 from starjax.addons.finetune.commands import finetune_stages
 from starjax.addons.finetune.commands.finetune_play import NoisyEpisodes, PolicyParams
 from starjax.addons.finetune.commands.finetune_work import Work
@@ -84,7 +84,7 @@ class PolicyGradient:
         self._progress = {file: progress}
         return file, counts
 
-    def _prepare(self, who: PolicyParams, played: Any) -> None:
+    def _prepare(self, who: PolicyParams, played: explore.Experience) -> None:
         """Begins to compile the program of the steps, for experience of these shapes."""
         begin = functools.partial(policy_gradient.begin, self._adam)
         key = jax.random.key(0)

@@ -4,13 +4,16 @@ import dataclasses
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from starjax.cli import checks, messages, options
 from starjax.core import errors
 from starjax.runtime import hub, progress, xla
+
+if TYPE_CHECKING:  # for annotations alone
+    from starjax.addons.formats import base
 
 _PIXELS = 128  # pixels per side of images that --cameras names
 _SHOWN = 10  # anomalies, the others are in a file
@@ -70,7 +73,7 @@ def _cameras(given: Sequence[str]) -> dict[str, Any]:
     return {name: CameraColumn(column=column, size=_PIXELS) for name, _, column in pairs}
 
 
-def _bring_back(source: Any, out: Path) -> int:
+def _bring_back(source: "base.Source", out: Path) -> int:
     from starjax.addons.formats import exchange
 
     with progress.track("Import", len(source.lengths), unit="episodes") as advance:
@@ -80,7 +83,7 @@ def _bring_back(source: Any, out: Path) -> int:
     return 0
 
 
-def _mapped(source: Any, args: ImportArgs, out: Path) -> int:
+def _mapped(source: "base.Source", args: ImportArgs, out: Path) -> int:
     from msgspec import structs
 
     from starjax.addons.formats import base, foreign, mapping, own_columns, ready

@@ -1,6 +1,6 @@
 """Phrases and drawing of needle drive, for reports."""
 
-from typing import Any
+import mujoco
 
 from starjax.sim.task import Outline, TaskText
 from starjax.tasks import outlines
@@ -19,6 +19,6 @@ TEXT = TaskText(
 )
 
 
-def outline(mj_model: Any) -> Outline:
+def outline(mj_model: mujoco.MjModel) -> Outline:
     """Returns the pad's rectangle."""
     return Outline((outlines.rectangle(mj_model, "pad"),), ())

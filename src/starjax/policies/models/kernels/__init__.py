@@ -12,8 +12,10 @@ from collections.abc import Callable
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
+from flax import linen as nn
 
 from starjax.core import extensions
+from starjax.core.types import ArrayTree
 
 Reference = TypeVar("Reference")
 
@@ -30,7 +32,7 @@ VARIANTS = {
 class RewrittenParams(Protocol):
     """Parameters in another form, a pytree node."""
 
-    def resolve(self, module: Any) -> tuple[Any, Any]:
+    def resolve(self, module: nn.Module) -> tuple[Any, Any]:
         """Returns the module to apply, in place of `module`, and the parameters that it takes."""
         ...
 
@@ -50,7 +52,7 @@ def choose(part: str, reference: Reference, *size: Any) -> Reference:
     return getattr(variant, name) if variant.pays(*size) else reference
 
 
-def packed(tree: Any, params: Any = None, platform: str | None = None) -> Any:
+def packed(tree: ArrayTree, params: ArrayTree | None = None, platform: str | None = None) -> Any:
     """Returns `tree` with its parts of the structure of `params` in fewer arrays, if faster.
 
     Args:
@@ -62,7 +64,7 @@ def packed(tree: Any, params: Any = None, platform: str | None = None) -> Any:
     return pack(tree, tree if params is None else params)
 
 
-def unpacked(tree: Any) -> Any:
+def unpacked(tree: ArrayTree) -> Any:
     """Returns the tree that `packed` was called with."""
     is_packed = lambda x: isinstance(x, RewrittenParams)  # noqa: E731
     return jax.tree.map(
@@ -70,12 +72,12 @@ def unpacked(tree: Any) -> Any:
     )
 
 
-def fused_unet(params: Any) -> Any:
+def fused_unet(params: ArrayTree) -> Any:
     """Returns the parameters of a `ConditionalUnet1D` in the form fastest to sample with."""
     return choose("fuse_unet", lambda params: params)(params)
 
 
-def applied(module: Any) -> Callable[..., Any]:
+def applied(module: nn.Module) -> Callable[..., Any]:
     """Returns a network's `apply` that also takes rewritten parameters.
 
     Called within a loop it unpacks parameters there, in the kernels that use them; before the loop

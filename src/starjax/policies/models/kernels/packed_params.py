@@ -13,7 +13,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from flax import linen as nn
 from flax import struct
+
+from starjax.core.types import ArrayTree
 
 PLATFORMS = {"gpu"}  # a CPU updates a vector as fast by itself
 
@@ -32,7 +35,7 @@ class Packed(struct.PyTreeNode):
     vectors: jax.Array
     shapes: tuple[Any, tuple[tuple[int, ...], ...]] = struct.field(pytree_node=False)
 
-    def resolve(self, module: Any) -> tuple[Any, Any]:
+    def resolve(self, module: nn.Module) -> tuple[Any, Any]:
         """Returns `module` and the parameters that were packed."""
         tree, shapes = self.shapes
         matrices = _turned(tree.flatten_up_to(self.matrices), 0, -1)
@@ -46,7 +49,7 @@ def pays(platform: str) -> bool:
     return platform in PLATFORMS
 
 
-def pack(state: Any, params: Any) -> Any:
+def pack(state: ArrayTree, params: ArrayTree) -> Any:
     """Packs every part of `state` with the structure of `params`: parameters, averages, moments.
 
     `params`, or their shapes, tell vectors from matrices: `state` may hold a matrix flat.
@@ -57,7 +60,7 @@ def pack(state: Any, params: Any) -> Any:
     def are_params(x: Any) -> bool:
         return jax.tree.structure(x) == structure
 
-    def packed(params: Any) -> Packed:
+    def packed(params: ArrayTree) -> Packed:
         pairs = list(zip(structure.flatten_up_to(params), shapes, strict=True))
         matrices = _turned([x if is_matrix(shape) else None for x, shape in pairs], -1, 0)
         vectors = _concatenated([x for x, shape in pairs if not is_matrix(shape)])
@@ -72,7 +75,9 @@ def is_matrix(shape: tuple[int, ...]) -> bool:
 
 
 @functools.cache
-def _same(structure: Any, shapes: tuple[tuple[int, ...], ...]) -> tuple[Any, Any]:
+def _same(
+    structure: jax.tree_util.PyTreeDef, shapes: tuple[tuple[int, ...], ...]
+) -> tuple[Any, Any]:
     """Returns one object for equal arguments: every call of a program compares them."""
     return structure, shapes
 
