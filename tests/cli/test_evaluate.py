@@ -1,6 +1,7 @@
 """Commands that score trained weights. The simulator is a stub."""
 
 import dataclasses
+import html
 import json
 import types
 
@@ -388,9 +389,15 @@ def test_a_policy_is_scored_at_every_level(file, capsys):
     assert all(level["strict"]["trials"] == 12 for level in levels.values())
     force = [level["wall_force_N"] for level in levels.values()]
     assert all(0 < level["mean"] <= level["p99"] <= level["max"] for level in force)
-    assert {"stress.md", "stress.png", "stress.pdf"} < {
-        path.name for path in result.parent.iterdir()
-    }
+    for level in levels.values():
+        assert len(level["failed"]) == 12 - level["strict"]["successes"]
+    names = {path.name for path in result.parent.iterdir()}
+    assert {"index.html", "stress.md", "stress.png", "stress.pdf"} < names
+    shown = html.unescape((result.parent / "index.html").read_text())
+    assert shown.count("starjax view --trials") == 2
+    for trials in ("0", "trocar_offset-5"):
+        assert f"{trials}/recorded.npz" in shown
+        assert (result.parent / trials / "recorded.npz").is_file()
     chunks = {path: path.stat().st_mtime_ns for path in result.parent.rglob("chunk*")}
     assert stressed("--disturbance", "trocar_offset", "--levels", "0", "5") == 0 and chunks
     assert all(path.stat().st_mtime_ns == then for path, then in chunks.items())

@@ -1,14 +1,14 @@
 """`starjax stress`: scores a trained policy under disturbances, one at a time."""
 
 import dataclasses
-import importlib.util
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starjax.cli import benchmark_args, messages, options, policy_args, scenes, session
 from starjax.core import config as config_lib
-from starjax.core import errors
+from starjax.core import errors, extras
 from starjax.core.limits import NotNegative
 from starjax.core.registry import Rows
 from starjax.evaluation import disturbances, protocol
@@ -29,7 +29,8 @@ Examples:
   starjax stress runs/cpu/stardiff --disturbance trocar_offset --levels 0 0.005"""
 
 
-_TRIALS = config_lib.TrialsConfig(trials=4, time_limit_s=30.0, video_trials=0)
+_RECORDED = "recorded.npz"  # of an evaluation
+_TRIALS = config_lib.TrialsConfig(trials=4, time_limit_s=30.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +50,7 @@ class StressArgs(benchmark_args.BenchmarkArgs, policy_args.PolicyArgs):
 
 
 def main(argv: Sequence[str]) -> int:
-    """Runs the missing trials; writes stress.json, its table and its figure."""
+    """Runs the missing trials; writes stress.json and its page."""
     args = options.parse("stress", StressArgs, argv, DESCRIPTION)
     benchmark_args.check(args, StressArgs())
     path = policy_args.resolve(args)
@@ -84,15 +85,15 @@ def main(argv: Sequence[str]) -> int:
             rows = {"what": kind.description, "unit": kind.unit, "levels": {}}
             content["disturbances"][name] = rows
             for level in args.levels or chosen.get(name) or kind.levels:
-                trials = folder / (f"{name}-{level:g}" if level else "0")
                 levels = {**dict.fromkeys(kinds, 0.0), name: level}
-                score = rows["levels"][f"{level:g}"] = _score(trials, who, levels, args)
+                score = _score(_folder(folder, levels), who, levels, args)
+                rows["levels"][f"{level:g}"] = score
                 print(_line(f"{level:g} {kind.unit}", score), flush=True)
                 if share.is_first:
                     started.write("stress.json", content)
         if together:
-            trials = folder / "-".join(f"{name}-{level:g}" for name, level in together.items())
-            score = _score(trials, who, {**dict.fromkeys(kinds, 0.0), **together}, args)
+            levels = {**dict.fromkeys(kinds, 0.0), **together}
+            score = _score(_folder(folder, together), who, levels, args)
             content["together"] = {"levels": together, **score}
             print(f"{' '.join(args.together)}\n{_line('together', score)}", flush=True)
         if share.is_first:
@@ -103,13 +104,40 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _draw(folder: Path) -> None:
-    """Writes the table and the figure if matplotlib is installed."""
-    if importlib.util.find_spec("matplotlib") is None:
+    """Writes the page, the table and the figure if the extra `report` is installed."""
+    if extras.missing("report"):
         return
-    from starjax.report import stress
+    from starjax.report import stress_page
 
-    for name, data in stress.files(files.read_json(folder / "stress.json")).items():
+    content = files.read_json(folder / "stress.json")
+    for name, data in stress_page.files(content, _failed(folder, content)).items():
         files.write_bytes(folder / name, data)
+    print(f"\nreport: {folder / 'index.html'}")
+
+
+def _failed(folder: Path, content: Mapping[str, Any]) -> list[list[str]]:
+    """Makes a row per level with failed trials, with the command that shows its recorded ones."""
+    levels = [
+        (name, level, score, _folder(folder, {name: float(level)}))
+        for name, kind in content["disturbances"].items()
+        for level, score in kind["levels"].items()
+    ]
+    if at_once := content.get("together"):
+        levels.append(("together", "", at_once, _folder(folder, at_once["levels"])))
+    rows = [["Disturbance", "Level", "Trials, as trocar-trial", "Command"]]
+    for name, level, score, trials in levels:
+        if score["failed"]:
+            names = ", ".join(f"{trocar}-{trial}" for trocar, trial in score["failed"])
+            file = shlex.quote(str(trials / _RECORDED))
+            shown = f"starjax view --trials {file}" if (trials / _RECORDED).is_file() else ""
+            rows.append([name, level, names, shown])
+    return rows if len(rows) > 1 else []
+
+
+def _folder(folder: Path, levels: Mapping[str, float]) -> Path:
+    """Returns the directory of the trials at levels of disturbances; level 0 is shared by all."""
+    names = [f"{name}-{level:g}" for name, level in levels.items() if level]
+    return folder / ("-".join(names) or "0")
 
 
 def _kinds(
@@ -174,6 +202,9 @@ def _score(
         "strict": statistics.rate(table.success),
         "safe": statistics.rate(table.safe),
         "invalid": int(table.invalid.sum()),
+        "failed": list(
+            zip(*(column[~table.success].tolist() for column in (table.trocar, table.trial)))
+        ),
         "rcm_error_mm": statistics.rcm_error_mm(table),
         "wall_force_N": wall.force(table, who.env.control_hz),
         **({"alarms": alarms.compose(table, monitor)} if monitor else {}),

@@ -32,12 +32,7 @@ def require(user: str, *extras: str) -> None:
       user: command or function that needs them, e.g. `train`.
       extras: keys of `PACKAGES`.
     """
-    absent = {
-        name: extra
-        for extra in extras
-        for name in PACKAGES[extra]
-        if importlib.util.find_spec(name) is None
-    }
+    absent = missing(*extras)
     if absent:
         wanted = ",".join(dict.fromkeys(absent.values()))
         raise errors.UsageError(
@@ -46,6 +41,16 @@ def require(user: str, *extras: str) -> None:
             "no such package",
             install(wanted),
         )
+
+
+def missing(*extras: str) -> dict[str, str]:
+    """Returns the packages of these extras that are not installed, each with its extra."""
+    return {
+        name: extra
+        for extra in extras
+        for name in PACKAGES[extra]
+        if importlib.util.find_spec(name) is None
+    }
 
 
 def install(wanted: str) -> str:

@@ -49,15 +49,27 @@ def build(
     if against:
         names = [*dict.fromkeys(run.result.method for run in loaded), tables.ALL]
         errors.choice("against", against, names)
-    focus = _focus(loaded)
-    recorded = any(run.rollouts for run in loaded)
+    return write(loaded, _focus(loaded), out, with_video, against, report)
+
+
+def write(
+    runs: Sequence[results.Run],
+    focus: results.Run,
+    out: pathlib.Path,
+    with_video: bool = True,
+    against: str = "",
+    report: Callable[[str], None] = print,
+    lead: page.Lead | None = None,
+) -> pathlib.Path:
+    """Writes the report of loaded runs with labels of their own, see `build` and `page.render`."""
+    recorded = any(run.rollouts for run in runs)
     with files.lock(out):
-        text = tables.markdown(loaded, against)
-        pairs, drawn = _figures(loaded, focus)
-        film = _film(loaded, out / _FILM, report) if with_video and recorded else None
+        text = tables.markdown(runs, against)
+        pairs, drawn = _figures(runs, focus)
+        film = _film(runs, out / _FILM, report) if with_video and recorded else None
         clip = film.read_bytes() if film else None
-        playback = _playback(loaded, report) if with_video and recorded else None
-        html = page.render(loaded, focus, pairs, clip, playback, against)
+        playback = _playback(runs, report) if with_video and recorded else None
+        html = page.render(runs, focus, pairs, clip, playback, against, lead)
         made = {"tables.md": text.encode(), **drawn, "index.html": html.encode()}
         made |= {_PLAYBACK: playback.html.encode()} if playback else {}
         for name, data in made.items():

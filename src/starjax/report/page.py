@@ -6,7 +6,7 @@ The page links to no other file. Its only script is that of the rollouts in 3D, 
 import base64
 import statistics
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jinja2
 
@@ -39,6 +39,18 @@ class Playback(NamedTuple):
     caption: str
 
 
+class Lead(NamedTuple):
+    """Another beginning of a page.
+
+    Attributes:
+      template: extends page.html.
+      values: names in the template -> values.
+    """
+
+    template: str
+    values: Mapping[str, Any]
+
+
 def render(
     runs: Sequence[results.Run],
     focus: results.Run,
@@ -46,14 +58,16 @@ def render(
     video: bytes | None,
     playback: Playback | None = None,
     against: str = "",
+    lead: Lead | None = None,
 ) -> str:
     """Renders the page of `runs`, whose headline numbers are those of `focus`.
 
     `against` is that of `tables.paired`.
     """
+    template, values = lead or Lead("page.html", {})
     return (
         environment()
-        .get_template("page.html")
+        .get_template(template)
         .render(
             runs=runs,
             focus=focus,
@@ -63,6 +77,7 @@ def render(
             video=video,
             playback=playback,
             against=against,
+            **values,
         )
     )
 

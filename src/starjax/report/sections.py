@@ -46,7 +46,7 @@ def facts(runs: Sequence[results.Run]) -> dict[str, str]:
     items = {
         "Observation": [compare.observed(runs)],
         "Trials" if len(runs) == 1 else "Trials per run": [_trials(run) for run in runs],
-        "Robot": [_robot(run) for run in runs],
+        "Robot": [robot(run.result.scene.arms, run.result.scene.tools) for run in runs],
         "Preset": [run.result.config.get("preset") for run in runs],
         "Seed": trained,
         "Seed of the trials": [] if scored == trained else scored,
@@ -60,10 +60,9 @@ def facts(runs: Sequence[results.Run]) -> dict[str, str]:
     return {name: text for name, text in texts.items() if text}
 
 
-def _robot(run: results.Run) -> str:
+def robot(arms: Sequence[str], tools: Sequence[str]) -> str:
     """Returns the robots' names, e.g. `fr5 with grasper`."""
-    arms = zip(run.result.scene.arms, run.result.scene.tools, strict=True)
-    return " and ".join(f"{arm} with {tool}" for arm, tool in arms)
+    return " and ".join(f"{arm} with {tool}" for arm, tool in zip(arms, tools, strict=True))
 
 
 def _trials(run: results.Run) -> str:

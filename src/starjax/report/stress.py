@@ -1,7 +1,7 @@
 """Table and figure of a stress.json: success and RCM error under each disturbance."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -12,9 +12,12 @@ if TYPE_CHECKING:
 
 NOTE = (
     "Each row is one disturbance alone, on the trials of the undisturbed policy. Success with its "
-    "95% Wilson interval; executed RCM error at the true trocar; force of a spring of 1 N/mm with "
-    "a damper at the trocar."
+    "95% Wilson interval; a loss is significant if Newcombe's 95% interval of the difference from "
+    "the undisturbed policy is above zero. Executed RCM error at the true trocar; force of a "
+    "spring of 1 N/mm with a damper at the trocar."
 )
+# Failures announced before the clock's alarm, and false alarms.
+_ALARMS = {"Alarms on failures": "before_clock", "On successes": "false_alarms"}
 _MIN_MM = 1e-2  # RCM error at the centre of its circle
 # Undisturbed to strongest.
 _SHADES = ("#2083C5", "#009E73", "#E69F00", "#D55E00", "#7A1F5C")
@@ -22,35 +25,49 @@ _SHADES = ("#2083C5", "#009E73", "#E69F00", "#D55E00", "#7A1F5C")
 Content = Mapping[str, Any]  # for a stress.json
 
 
-def table(content: Content) -> formats.Table:
-    """Makes a row per level of each disturbance."""
-    header = [
-        "Disturbance",
-        "Level",
-        "Success (%)",
-        "RCM mean (mm)",
-        "RCM p99 (mm)",
-        "Wall p99 (N)",
-    ]
-    kinds = content["disturbances"]
-    is_watched = any(
-        "alarms" in score for kind in kinds.values() for score in kind["levels"].values()
-    )
-    rows = [header + ["Alarms on failures", "On successes"] * is_watched]
-    scores = [
-        (name, f"{level} {kind['unit']}".strip(), score)
-        for name, kind in kinds.items()
+class Score(NamedTuple):
+    """A level of a disturbance.
+
+    Attributes:
+      name: the disturbance, or `together`.
+      effect: its description.
+      level: with its unit.
+      is_undisturbed: the level is zero.
+      success: strict.
+      measured: name -> text of RCM errors and of the force on the abdominal wall.
+      alarms: name -> text of a monitor's alarms, empty without a monitor.
+    """
+
+    name: str
+    effect: str
+    level: str
+    is_undisturbed: bool
+    success: stats.Rate
+    measured: dict[str, str]
+    alarms: dict[str, str]
+
+
+def scores(content: Content) -> list[Score]:
+    """Returns all levels of all disturbances in their order, then those at once."""
+    found = [
+        _score(name, kind.get("what", ""), f"{level} {kind['unit']}".strip(), score)
+        for name, kind in content["disturbances"].items()
         for level, score in kind["levels"].items()
     ]
     if together := content.get("together"):
         at_once = ", ".join(f"{name} {level:g}" for name, level in together["levels"].items())
-        scores.append(("together", at_once, together))
-    for name, level, score in scores:
-        error, wall = score["rcm_error_mm"]["executed"], score.get("wall_force_N") or {}
-        values = (error["mean"], error["p99"], wall.get("p99"))
-        cells = ["\u2013" if value is None else f"{value:.2f}" for value in values]
-        rows.append([name, level, _rate(score), *cells])
-        rows[-1] += _alarms(score) if is_watched else []
+        found.append(_score("together", "", at_once, together))
+    return found
+
+
+def table(content: Content) -> formats.Table:
+    """Makes a row per level of each disturbance."""
+    found = scores(content)
+    alarms = next((score.alarms for score in found if score.alarms), {})
+    rows = [["Disturbance", "Level", "Success (%)", *found[0].measured, *alarms]]
+    for score in found:
+        cells = [*score.measured.values(), *score.alarms.values()]
+        rows.append([score.name, score.level, formats.rate(score.success), *cells])
     return rows
 
 
@@ -99,25 +116,27 @@ def draw(content: Content, dark: bool = False) -> Any:
     return figure
 
 
-def files(content: Content) -> dict[str, bytes]:
-    """Makes the files of table and figure, by name."""
-    figure = draw(content)
-    return {
-        "stress.md": markdown(content).encode(),
-        "stress.png": style.save(figure, "png"),
-        "stress.pdf": style.save(figure, "pdf"),
+def _score(name: str, effect: str, level: str, score: Content) -> Score:
+    error, wall = score["rcm_error_mm"]["executed"], score.get("wall_force_N") or {}
+    figures = {
+        "RCM mean (mm)": error["mean"],
+        "RCM p99 (mm)": error["p99"],
+        "Wall p99 (N)": wall.get("p99"),
     }
-
-
-def _rate(score: Content) -> str:
-    strict = score["strict"]
-    return formats.rate(stats.rate(strict["successes"], strict["trials"]))
-
-
-def _alarms(score: Content) -> list[str]:
-    """Returns the failures announced before the clock's alarm, and the false alarms."""
-    rates = [score["alarms"][name] for name in ("before_clock", "false_alarms")]
-    return [f"{rate['successes']}/{rate['trials']}" for rate in rates]
+    alarms = score.get("alarms") or {}
+    return Score(
+        name,
+        effect,
+        level,
+        is_undisturbed=level.split()[0] == "0",
+        success=stats.rate(score["strict"]["successes"], score["strict"]["trials"]),
+        measured={k: "\u2013" if v is None else f"{v:.2f}" for k, v in figures.items()},
+        alarms={
+            title: f"{alarms[key]['successes']}/{alarms[key]['trials']}"
+            for title, key in _ALARMS.items()
+            if alarms
+        },
+    )
 
 
 def _span(kind: Content) -> str:

@@ -37,9 +37,7 @@ class FinetuneConfig:
     validation: Count = 60  # trials per seen trocar that choose the best round
     seed: config_lib.Seed = 0  # random seed of everything that is drawn
     # trials of the report, before and after, on all trocars of the task
-    eval: config_lib.TrialsConfig = dataclasses.field(
-        default_factory=lambda: config_lib.TrialsConfig(video_trials=0)
-    )
+    eval: config_lib.TrialsConfig = dataclasses.field(default_factory=config_lib.TrialsConfig)
 
 
 # Two cores take some minutes per round.
@@ -50,5 +48,5 @@ ON_CPU = FinetuneConfig(
     episodes=32,
     dtype="float32",
     validation=12,
-    eval=config_lib.TrialsConfig(trials=12, time_limit_s=20.0, video_trials=0),
+    eval=config_lib.TrialsConfig(trials=12, time_limit_s=20.0),
 )

@@ -13,7 +13,7 @@ from starjax.addons.finetune.commands import finetune_work as works
 from starjax.addons.finetune.commands.finetune_work import Work
 from starjax.addons.finetune.settings import FinetuneConfig
 from starjax.cli import messages, policy_args, policy_evaluation, session, stage_times
-from starjax.core import errors, methods
+from starjax.core import errors, extras, methods
 from starjax.evaluation import statistics
 from starjax.policies.in_env import PolicyInEnv
 from starjax.rollouts.sharing import Share
@@ -62,7 +62,11 @@ def run(
             messages.indented(f"validation {messages.rate(rate)}")
             if number < settings.rounds and not work.is_trained(number + 1):
                 _keep(work, candidates, described, reports)
-        _keep(work, candidates, described, reports)
+        content = _keep(work, candidates, described, reports)
+    if not extras.missing("report", "video"):
+        from starjax.addons.finetune.commands import finetune_page
+
+        print(f"report: {finetune_page.write(work.out, content)}", flush=True)
 
 
 def _plan(work: Work) -> str:
@@ -104,8 +108,8 @@ def _keep(
     candidates: list[Path],
     described: list[dict[str, Any]],
     reports: dict[int, dict[str, Any]],
-) -> None:
-    """Keeps the best round so far; scores it and the policy itself on all trocars.
+) -> dict[str, Any]:
+    """Keeps the best round so far; scores it and the policy itself; returns their figures.
 
     Every round ends with it: a fine-tuning that is stopped later has an outcome. `reports` has the
     figures by round, and gets the new ones.
@@ -135,6 +139,7 @@ def _keep(
         print(f"  {name:24}{messages.rate(row['seen']):26}{messages.rate(row['unseen'])}")
     kept = f"round {best}" if best else "the policy itself: no round is better in validation"
     print(f"\npolicy: {work.out / 'policy.safetensors'}, {kept}; figures: {path}", flush=True)
+    return content
 
 
 def _score(work: Work, name: str, who: PolicyInEnv) -> dict[str, Any]:
