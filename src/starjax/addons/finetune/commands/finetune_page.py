@@ -65,7 +65,7 @@ def _cards(runs: list[results.Run], test: Paired | None) -> Iterator[Card]:
 
 
 def _round(row: Mapping[str, Any], best: int) -> tuple[str, Rate, str]:
-    """Returns name, success in validation and what was learned of a round."""
+    """Returns name, success in validation and training episodes of a round."""
     name = str(row["round"]) if row["round"] else "0, the policy itself"
     won = row["validation"]
     learned = ""
