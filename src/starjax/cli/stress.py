@@ -29,7 +29,7 @@ Examples:
   starjax stress runs/cpu/stardiff --disturbance trocar_offset --levels 0 0.005"""
 
 
-_RECORDED = "recorded.npz"  # of an evaluation
+_RECORDED = "recorded.npz"
 _TRIALS = config_lib.TrialsConfig(trials=4, time_limit_s=30.0)
 
 

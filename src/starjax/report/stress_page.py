@@ -81,7 +81,7 @@ def cards(content: Mapping[str, Any]) -> Iterator[sections.Card]:
         yield sections.Card("Shaft off the trocar, at most", most.measured[_ERROR], " mm", more)
 
 
-_ERROR = "RCM p99 (mm)"  # of `stress.Score.measured`
+_ERROR = "RCM p99 (mm)"  # name in `stress.Score.measured`
 
 
 def _facts(content: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -49,7 +49,7 @@ def _verdict(runs: list[results.Run], test: Paired | None) -> str:
     )
 
 
-_LEVEL = 0.05  # of significance
+_LEVEL = 0.05  # significance level
 
 
 def _cards(runs: list[results.Run], test: Paired | None) -> Iterator[Card]:
