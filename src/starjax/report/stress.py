@@ -25,7 +25,7 @@ _SHADES = ("#2083C5", "#009E73", "#E69F00", "#D55E00", "#7A1F5C")
 Content = Mapping[str, Any]  # for a stress.json
 
 
-class Score(NamedTuple):
+class StressRow(NamedTuple):
     """A level of a disturbance.
 
     Attributes:
@@ -47,7 +47,7 @@ class Score(NamedTuple):
     alarms: dict[str, str]
 
 
-def scores(content: Content) -> list[Score]:
+def scores(content: Content) -> list[StressRow]:
     """Returns all levels of all disturbances in their order, then those at once."""
     found = [
         _score(name, kind.get("what", ""), f"{level} {kind['unit']}".strip(), score)
@@ -116,7 +116,7 @@ def draw(content: Content, dark: bool = False) -> Any:
     return figure
 
 
-def _score(name: str, effect: str, level: str, score: Content) -> Score:
+def _score(name: str, effect: str, level: str, score: Content) -> StressRow:
     error, wall = score["rcm_error_mm"]["executed"], score.get("wall_force_N") or {}
     figures = {
         "RCM mean (mm)": error["mean"],
@@ -124,7 +124,7 @@ def _score(name: str, effect: str, level: str, score: Content) -> Score:
         "Wall p99 (N)": wall.get("p99"),
     }
     alarms = score.get("alarms") or {}
-    return Score(
+    return StressRow(
         name,
         effect,
         level,

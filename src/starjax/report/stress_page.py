@@ -81,7 +81,7 @@ def cards(content: Mapping[str, Any]) -> Iterator[sections.Card]:
         yield sections.Card("Shaft off the trocar, at most", most.measured[_ERROR], " mm", more)
 
 
-_ERROR = "RCM p99 (mm)"  # name in `stress.Score.measured`
+_ERROR = "RCM p99 (mm)"  # name in `stress.StressRow.measured`
 
 
 def _facts(content: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -96,5 +96,5 @@ def _facts(content: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _named(score: stress.Score) -> str:
+def _named(score: stress.StressRow) -> str:
     return f"{score.name} {score.level}"
