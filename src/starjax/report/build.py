@@ -59,7 +59,7 @@ def write(
     with_video: bool = True,
     against: str = "",
     report: Callable[[str], None] = print,
-    lead: page.Lead | None = None,
+    lead: page.PageLead | None = None,
 ) -> pathlib.Path:
     """Writes the report of loaded runs with labels of their own, see `build` and `page.render`."""
     recorded = any(run.rollouts for run in runs)

@@ -39,7 +39,7 @@ class Playback(NamedTuple):
     caption: str
 
 
-class Lead(NamedTuple):
+class PageLead(NamedTuple):
     """Another beginning of a page.
 
     Attributes:
@@ -58,13 +58,13 @@ def render(
     video: bytes | None,
     playback: Playback | None = None,
     against: str = "",
-    lead: Lead | None = None,
+    lead: PageLead | None = None,
 ) -> str:
     """Renders the page of `runs`, whose headline numbers are those of `focus`.
 
     `against` is that of `tables.paired`.
     """
-    template, values = lead or Lead("page.html", {})
+    template, values = lead or PageLead("page.html", {})
     return (
         environment()
         .get_template(template)

@@ -31,7 +31,7 @@ def write(out: Path, content: Mapping[str, Any]) -> Path:
         runs[-1],
         out / "report",
         report=messages.indented,
-        lead=page.Lead("finetune.html", values),
+        lead=page.PageLead("finetune.html", values),
     )
 
 
