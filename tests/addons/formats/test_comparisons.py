@@ -53,6 +53,7 @@ SLIPS = {
         added(time=lambda a: 2 * a["time"]),
         "15 Hz",
     ),
+    "rate of the files": ("time stamps, `hz`", structs.replace(MAP, hz=20.0), None, "30 Hz"),
     "relative commands": (
         "commands, next tips", changed_arm(**COMMANDS), added(cp=relative), "relative"
     ),
@@ -73,6 +74,18 @@ SLIPS = {
         MAP,
         added(jaws0=lambda a: 40 + 40 * a["jaws0"]),
         "gripper",
+    ),
+    "commanded gripper": (
+        "gripper values, `gripper_closed` to `gripper_open`",
+        changed_arm(command_gripper="cg"),
+        added(cg=lambda a: 40 + 40 * a["jaws0"]),
+        "gripper",
+    ),
+    "distance as success": (
+        "`success`, 0 to 1",
+        structs.replace(MAP, success="goal"),
+        added(goal=lambda a: np.linspace(60.0, 2.0, len(a["time"]))),
+        "goal ends",
     ),
     "shaft reversed": ("shafts, trocars", changed_arm(tip_turn=REVERSED), None, "before the"),
     "shaft next to": (
@@ -132,6 +145,13 @@ REFUSED = {
         added(R0=lambda a: a["R0"] * [1.0, 1.0, -1.0]),
         "rotation",
         "mirrored",
+    ),
+    "degrees of a rotation": (
+        "angles of a rotation, two turns",
+        changed_arm(rotation_as="euler_xyz"),
+        added(R0=lambda a: transform.Rotation.from_matrix(a["R0"]).as_euler("xyz", True)),
+        "rotation",
+        "degrees",
     ),
     "mm": ("positions, the origin", MAP, added(p0=lambda a: 1e3 * a["p0"]), "position", "30"),
     "times": (

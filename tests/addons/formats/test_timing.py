@@ -1,5 +1,6 @@
 """The contract of time, names and units holds for every format, as the page's table says."""
 
+import os
 import pathlib
 import re
 import shutil
@@ -167,12 +168,12 @@ def robot(tmp_path, columns, names=(), order=()):
 
 
 @pytest.mark.parametrize("order", [JOINTS, ()])
-@pytest.mark.parametrize("ending", ["", ".pos"])
-def test_joints_are_taken_by_their_names(tmp_path, order, ending):
+@pytest.mark.parametrize("called", ["{}", "{}.pos", "left_{}"])
+def test_joints_are_taken_by_their_names(tmp_path, order, called):
     plain = robot(tmp_path, lambda q: np.stack([q[n] for n in JOINTS], -1), JOINTS, JOINTS)
     bring(tmp_path, *plain, "plain")
     mixed = sorted(JOINTS)
-    names = [f"{name}{ending}" for name in mixed]
+    names = [called.format(name) for name in mixed]
     other = robot(tmp_path, lambda q: np.stack([q[n] for n in mixed], -1), names, order)
     bring(tmp_path, *other, "mixed")
     np.testing.assert_array_equal(tips(tmp_path / "mixed"), tips(tmp_path / "plain"))
@@ -214,39 +215,40 @@ def tips(root):
     return np.load(path / "p.npy")
 
 
+@pytest.mark.parametrize("k", [0, 1])
 @pytest.mark.parametrize("name", ["csv", "aloha", "lerobot-v2.1", "rosbag", "robomimic"])
-def test_a_file_that_cannot_be_read_is_an_episode_left_out(tmp_path, name):
+def test_a_file_that_cannot_be_read_is_an_episode_left_out(tmp_path, name, k):
     path = several.write(name, tmp_path / "theirs", [recording(i) for i in range(3)])
     if name == "robomimic":
         with h5py.File(path, "a") as file:
-            del file["data/demo_1"]
-            file["data/demo_1"] = 0.0
-        bad = "demo_1"
+            del file[f"data/demo_{k}"]
+            file[f"data/demo_{k}"] = 0.0
+        bad = f"demo_{k}"
     elif name == "lerobot-v2.1":
-        (victim,) = path.rglob("episode_000001.parquet")
+        (victim,) = path.rglob(f"episode_00000{k}.parquet")
         victim.write_bytes(victim.read_bytes()[:200])
-        bad = "episode 1"
+        bad = f"episode {k}"
     else:
-        (victim,) = (x for x in path.rglob("episode_1*") if x.is_file())
+        (victim,) = (x for x in path.rglob(f"episode_{k}*") if x.is_file())
         victim.write_bytes(victim.read_bytes()[:-30])
-        bad = "episode_1"
+        bad = f"episode_{k}"
     with opened(path) as source:
         found = foreign.import_mapped(source, several.mapping(name), tmp_path / "d", path)
         assert (found.episodes, found.left_out) == (2, 1)
         (line,) = found.notes
         assert bad in line and "\n" not in line
-        made = several.mapping(name, skip=(1,))
+        made = several.mapping(name, skip=(k,))
         assert not foreign.import_mapped(source, made, tmp_path / "e", path).notes
 
 
-@pytest.mark.parametrize("name", ["csv", "aloha", "rosbag", "jigsaws"])
+@pytest.mark.parametrize("name", ["csv", "aloha", "rosbag", "jigsaws", "lerobot", "zarr"])
 def test_hidden_files_are_skipped(tmp_path, name):
     path = tmp_path / "theirs"
     if name == "jigsaws":
         path.mkdir()
         np.savetxt(path / "Suturing_B001.txt", np.random.default_rng(0).normal(size=(9, 76)))
     else:
-        several.write(name, path, [recording()])
+        path = several.write(name, path, [recording()])
     for file in [x for x in path.rglob("*") if x.is_file()]:
         file.with_name(f"._{file.name}").write_bytes(b"\x00\x05\x16\x07Mac OS X")
     assert base.detect(path) == name
@@ -317,6 +319,34 @@ def test_steps_before_a_streams_first_value_are_left_out():
         timing.usable(found, ["jaw"], 0.5)
 
 
+@pytest.mark.parametrize("period", [0.05, 0.45])
+def test_slow_clocks_and_held_values_are_noted(tmp_path, period):
+    plain = strangers_source().read(0, ["time", "p0", "R0", "jaws0", "state"])
+    held = np.searchsorted(plain["time"], period * (plain["time"] // period) - 1e-9)
+
+    def hold(arrays):
+        return arrays | {name: arrays[name][held] for name in ("p0", "R0")}
+
+    def hold_images(arrays):
+        frames = np.zeros((len(held), 12, 16, 3), np.uint8) + held[:, None, None, None]
+        return arrays | {"image": frames.astype(np.uint8)}
+
+    slow = np.unique(held)
+    cameras = {"camera": CameraColumn(column="image")}
+    timed = structs.replace(MAP, time="time")
+    cases = {
+        "pose": (strangers_source(change=hold), MAP),
+        "image": (
+            strangers_source(change=hold_images, images=True), structs.replace(MAP, cameras=cameras)
+        ),
+        "apart": (strangers_source(change=lambda a: {n: x[slow] for n, x in a.items()}), timed),
+    }  # fmt: skip
+    for word, (given, made) in cases.items():
+        given = given._replace(hz=0.0 if made.time else given.hz)
+        notes = bring(tmp_path, given, made, word).notes
+        assert any(word in line for line in notes) == (period > 0.1), notes
+
+
 @pytest.mark.parametrize("what", ["image", "pose", "two arms"])
 def test_streams_that_leave_their_last_value_are_noted(tmp_path, what):
     def change(arrays):
@@ -347,6 +377,7 @@ def test_an_import_goes_on_with_the_same_files_only(tmp_path, monkeypatch):
         if stop.left < 0:
             raise KeyboardInterrupt
 
+    before = (path / "episode_0.csv").stat()
     for change in (False, True):
         out, stop.left = tmp_path / f"d{change}", 3  # two readings, one episode
         with opened(path) as source, pytest.raises(KeyboardInterrupt):
@@ -354,12 +385,54 @@ def test_an_import_goes_on_with_the_same_files_only(tmp_path, monkeypatch):
         if change:
             file = path / "episode_0.csv"
             file.write_text(file.read_text().replace("1", "2", 1))
+            os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))  # as a copy may keep them
         with opened(path) as source:
             if change:
                 with mistakes.of("OUT", "episode_0.csv"):
                     foreign.import_mapped(source, made, out, path)
             else:
                 assert foreign.import_mapped(source, made, out, path).episodes == 2
+
+
+@pytest.mark.parametrize("name", ["elapsed_ms", "t_ns", "time_us", "Time (s)", "t"])
+def test_times_are_known_by_their_names(name):
+    assert name in clocks.named({name: Column((), "float64")}) and not clocks.own_words(name)
+
+
+def test_dates_in_csv_are_times(tmp_path):
+    text = "\n".join(f"2026-11-28 10:00:{i / 50:09.6f},{i}" for i in range(100))
+    (tmp_path / "a.csv").write_text(f"stamp,x\n{text}\n")
+    with opened(tmp_path / "a.csv") as source:
+        times = source.read(0, ["stamp"])["stamp"]
+        np.testing.assert_allclose(np.diff(times), 0.02, atol=1e-6)
+
+
+@pytest.mark.parametrize("by", [",", ";", "\t", "|", ", "])
+def test_delimiters_of_csv(tmp_path, by):
+    rows = [("x", "y"), ("0.5", "1.5"), ("2", "3")]
+    (tmp_path / "a.csv").write_text("\n".join(by.join(row) for row in rows))
+    with opened(tmp_path / "a.csv") as source:
+        np.testing.assert_array_equal(source.read(0, ["y"])["y"], [1.5, 3.0])
+
+
+def test_a_file_without_delimiters_is_refused_by_its_first_line(tmp_path):
+    (tmp_path / "a.csv").write_text("# of a lab\nx,y\n1,2\n")
+    with mistakes.of(str(tmp_path / "a.csv"), "of a lab"), opened(tmp_path / "a.csv"):
+        pass
+
+
+def test_a_link_that_leads_nowhere_is_one_line(tmp_path):
+    (tmp_path / "a.csv").symlink_to("/nowhere/a.csv")
+    with mistakes.of(str(tmp_path), "/nowhere/a.csv"):
+        base.detect(tmp_path)
+
+
+def test_a_refused_dataset_comes_with_doubts_on_its_names(tmp_path):
+    given, made = entries("quat_wxyz", ("qw", "qx", "qy", "qz"))
+    arm = structs.replace(made.arms[0], rotation_as="quat_xyzw")
+    with mistakes.of("PATH", "trocar") as caught:
+        bring(tmp_path, given, structs.replace(made, arms=(arm,)))
+    assert "qw, qx" in caught.value.hint
 
 
 def test_no_success_is_noted(tmp_path):

@@ -1,6 +1,7 @@
 """Interface of all formats: datasets as named columns of episodes."""
 
 import contextlib
+import functools
 import math
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -10,6 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike
 
+from starjax.addons.formats import file_states
+from starjax.addons.formats.file_states import FileState
 from starjax.core import errors
 from starjax.core.registry import Registry
 from starjax.runtime import files, xla
@@ -82,7 +85,7 @@ class Source(NamedTuple):
       notes: anomalies of the files, one per line.
       splits: name -> its episodes, e.g. `train`, `test`, `recovery`, `failure`.
       texts: (episode) -> texts by column: instructions, tools.
-      files: name -> its bytes and time of change in ns.
+      files: () -> of each file by name its bytes, time of change in ns, and digest of its ends.
       faults: episode -> reason why it cannot be read.
       timing: (episode) -> times, of a format whose columns are streams with times of their own.
       by: (columns) -> the source of these streams joined at the first; None if columns are rows.
@@ -98,7 +101,7 @@ class Source(NamedTuple):
     notes: Sequence[str] = ()
     splits: Mapping[str, range] = {}
     texts: Callable[[int], Mapping[str, Sequence[str]]] = lambda episode: {}
-    files: Mapping[str, tuple[int, int]] = {}
+    files: Callable[[], Mapping[str, FileState]] = dict
     faults: Mapping[int, str] = {}
     timing: Callable[[int], StepTimes] | None = None
     by: "Callable[[Sequence[str]], Source] | None" = None
@@ -151,8 +154,9 @@ def detect(path: Path) -> str:
     if not path.exists():
         raise errors.UsageError("PATH", "a dataset", f"{path}, which does not exist")
     for name in FORMATS.names():
-        if _recognises(name, path):
-            return name
+        with explained(path, name):
+            if _recognises(name, path):
+                return name
     raise errors.UsageError("PATH", ", ".join(FORMATS.names()), f"{path} of unknown format")
 
 
@@ -191,15 +195,7 @@ def open_dataset(path: Path, name: str) -> Iterator[Source]:
             require(bool(source.lengths), "episodes", 0)
             require(0.0 <= source.hz < _MAX_HZ, "steps per second", source.hz)
 
-        yield _checked(source._replace(files=dict(_files(path))), path, name)
-
-
-def _files(path: Path) -> Iterator[tuple[str, tuple[int, int]]]:
-    """Yields names, bytes and times of the files of a dataset."""
-    for file in [path] if path.is_file() else sorted(path.rglob("*")):
-        if file.is_file():
-            about = file.stat()
-            yield file.relative_to(path.parent).as_posix(), (about.st_size, about.st_mtime_ns)
+        yield _checked(source._replace(files=functools.partial(file_states.of, path)), path, name)
 
 
 def _checked(source: Source, path: Path, name: str) -> Source:

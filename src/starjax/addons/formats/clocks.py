@@ -9,7 +9,7 @@ from starjax.addons.formats.base import Column, Source
 
 _UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _USUAL = (2e-4, 0.9)  # s, periods of recordings
-_WORDS = {"time", "times", "timestamp", "timestamps", "stamp", "stamps"}
+_WORDS = {"time", "times", "timestamp", "timestamps", "stamp", "stamps", "elapsed"}
 _OTHER_TIMES = {"left", "limit", "max", "delta", "to", "next", "remaining"}
 _SECONDS = re.compile(r"(.*[./_])?secs?")
 
@@ -20,7 +20,7 @@ def named(columns: Mapping[str, Column]) -> dict[str, tuple[str, ...]]:
     found = {}
     for name in sorted(single):
         words = set(_split(name))
-        if name == "t" or (words & _WORDS and not words & _OTHER_TIMES):
+        if words - {*_UNITS} == {"t"} or (words & _WORDS and not words & _OTHER_TIMES):
             found[name] = (name,)
         if _SECONDS.fullmatch(name):
             found.pop(name, None)
@@ -76,7 +76,7 @@ def values(arrays: Mapping[str, np.ndarray], parts: tuple[str, ...]) -> np.ndarr
 
 def own_words(name: str) -> list[str]:
     """Returns the words of a clock's name that say whose it is."""
-    general = _WORDS | {"t", "header", "observation", "observations", "obs", "sec", "secs", "s"}
+    general = _WORDS | {"t", "header", "observation", "observations", "obs", "sec", "secs", *_UNITS}
     return [word for word in _split(name) if word not in general]
 
 

@@ -1,7 +1,7 @@
 """CSV with a header: a file or a folder with a file per episode, or a column `episode`.
 
-Columns are separated by commas, semicolons (numbers may then have decimal commas) or tabs; text is
-UTF-8, UTF-16 or Latin-1.
+Columns are separated by commas, semicolons (numbers may then have decimal commas), bars or tabs;
+text is UTF-8, UTF-16 or Latin-1. Dates and times of day are seconds.
 """
 
 import codecs
@@ -53,12 +53,15 @@ def _read(path: Path, names: Collection[str], rows: slice = slice(None)) -> dict
         tables.ParseOptions(delimiter=delimiter),
         tables.ConvertOptions(decimal_point=decimal_point),
     )
+    table = table.rename_columns([name.strip() for name in table.column_names])
     arrays = {}
     for name in names or table.column_names:
         if name not in table.column_names:
             continue
         cells = table[name]
-        if _is_number(cells.type):
+        if pa.types.is_timestamp(cells.type) or pa.types.is_time(cells.type):
+            arrays[name] = _seconds(cells)[rows]
+        elif _is_number(cells.type):
             arrays[name] = cells.to_numpy().astype(np.float64)[rows]
         elif (is_number := _are_numbers(cells)) is not None:
             words = np.flatnonzero(~is_number[rows]) + (rows.start or 0)
@@ -69,6 +72,13 @@ def _read(path: Path, names: Collection[str], rows: slice = slice(None)) -> dict
             texts = np.where(is_number, cells.to_numpy(zero_copy_only=False), "nan")[rows]
             arrays[name] = np.array([float(text.replace(",", ".")) for text in texts])
     return arrays
+
+
+def _seconds(cells: pa.ChunkedArray) -> np.ndarray:
+    """Returns dates or times of day as s, NaN for empty cells."""
+    kind = pa.timestamp("ns") if pa.types.is_timestamp(cells.type) else pa.time64("ns")
+    counts = pc.cast(pc.cast(cells, kind), pa.int64()).to_numpy(zero_copy_only=False)
+    return 1e-9 * np.asarray(counts, np.float64)
 
 
 def _are_numbers(cells: pa.ChunkedArray) -> np.ndarray | None:
@@ -92,7 +102,9 @@ def _dialect(path: Path) -> _Dialect:
         except UnicodeDecodeError:
             encoding = "latin-1"
     header, _, body = data.decode(encoding, "ignore").partition("\n")
-    delimiter = max(",;\t", key=header.count)
+    delimiter = max(",;\t|", key=header.count)
+    expected = "columns separated by , ; | or tabs in the first line"
+    base.require(delimiter in header, expected, repr(header[:40].strip()))
     has_commas = delimiter != "," and re.search(r"\d,\d", body) is not None
     return _Dialect(encoding, delimiter, "," if has_commas else ".")
 

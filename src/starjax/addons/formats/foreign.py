@@ -152,15 +152,13 @@ def _fits(mapping: Map, task: Task) -> None:
 
 
 def _require_same_files(root: Path, source: Source) -> None:
-    """Records sizes and times of the source's files; a stopped import needs the same ones.
+    """Records the state of the source's files; a stopped import needs the same ones.
 
     Raises:
       errors.UsageError: a file changed since the import began.
     """
-    path, present = (
-        root / schema.IMPORTED_FILES,
-        {name: list(x) for name, x in source.files.items()},
-    )
+    path = root / schema.IMPORTED_FILES
+    present = {name: list(state) for name, state in source.files().items()}
     if store.keys(root) and path.exists():
         began = files.read_json(path)
         changed = sorted(n for n in {**began, **present} if began.get(n) != present.get(n))
@@ -188,7 +186,7 @@ def _describe(
 ) -> dict[str, Any]:
     reference = np.array([slot.p_world_ref for slot in task.slots])
     parameters = rcm.trocar_from_position(centres.astype(np.float32), reference.astype(np.float32))
-    shapes = _shapes(source, mapping, len(task.slots))
+    shapes = _shapes(source, mapping, len(task.slots), kept[0].episode)
     unknown = [source.robot or "unknown"] * len(task.slots)
     return {
         "schema": store.SCHEMA,
@@ -221,7 +219,9 @@ def _describe(
     }
 
 
-def _shapes(source: Source, mapping: Map, arms: int) -> dict[str, tuple[tuple[int, ...], str]]:
+def _shapes(
+    source: Source, mapping: Map, arms: int, episode: int
+) -> dict[str, tuple[tuple[int, ...], str]]:
     real = np.dtype(np.float32).str
     shapes: dict[str, tuple[tuple[int, ...], str]] = {
         f"{before}{name}": ((arms, *shape), real)
@@ -232,7 +232,7 @@ def _shapes(source: Source, mapping: Map, arms: int) -> dict[str, tuple[tuple[in
     if maps.has_shaft(mapping):
         shapes |= {"shaft_p": ((arms, 3), real), "shaft_R": ((arms, 3, 3), real)}
     if mapping.state:
-        rows = maps.pick(source.read(0, maps.names(mapping)), mapping.state)
+        rows = maps.pick(source.read(episode, maps.names(mapping)), mapping.state)
         shapes["state"] = (rows.shape[1:], real)
     for name, camera in mapping.cameras.items():
         shape = source.columns[camera.column].shape

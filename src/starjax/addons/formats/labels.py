@@ -82,6 +82,7 @@ def _by_joints(arm: ArmColumns, source: Source, folder: Path) -> ArmColumns:
     labels = [_joint(label) for label in of(arm.joints, source)]
     known = {_joint(name): name for name in tip_poses.joint_names(folder / arm.model)}
     wanted = [_joint(name) for name in arm.joint_names]
+    labels = _shortened(labels, wanted or list(known))
     if not wanted and set(labels) <= set(known):
         return structs.replace(arm, joint_names=tuple(known[label] for label in labels))
     wanted = wanted or list(known)[: len(labels)]
@@ -102,6 +103,15 @@ def _entries(columns: Columns, source: Source) -> list[str]:
         size = math.prod(source.columns[name].shape)
         entries += [f"{name}[{k}]" for k in range(size)[low:high]]
     return entries
+
+
+def _shortened(labels: list[str], joints: list[str]) -> list[str]:
+    """Returns labels without words before a joint's name: `left_yaw` is `yaw`."""
+    shortened = []
+    for label in labels:
+        ends = [name for name in joints if re.search(rf"[^a-z0-9]{re.escape(name)}$", label)]
+        shortened.append(label if label in joints else max(ends, key=len, default=label))
+    return shortened if len(set(shortened)) == len(labels) else labels
 
 
 def _joint(name: str) -> str:

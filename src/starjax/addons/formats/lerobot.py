@@ -24,7 +24,7 @@ import pyarrow as pa
 import pyarrow.parquet as parquet
 from PIL import Image
 
-from starjax.addons.formats import base, lerobot_meta, lerobot_write, video
+from starjax.addons.formats import base, lerobot_meta, lerobot_write, per_file, video
 from starjax.addons.formats.base import Column, Source
 from starjax.rollouts import episodes
 from starjax.runtime import files
@@ -154,7 +154,7 @@ def _column(feature: dict[str, Any]) -> Column | None:
 
 
 def _places_v3(root: Path, info: dict[str, Any], cameras: list[str]) -> Iterator[_Place]:
-    paths = sorted((root / "meta/episodes").glob("*/*.parquet"))
+    paths = per_file.listed(root / "meta/episodes", "*/*.parquet")
     base.require(bool(paths), "meta/episodes/*/*.parquet", "none")
     for path in paths:
         table = parquet.read_table(base.require_inside(root, path))

@@ -187,7 +187,7 @@ def pick(arrays: Mapping[str, np.ndarray], columns: Columns, count: int = 0) -> 
         bad = ~np.isfinite(rows).all(-1)
         if bad.any():
             where = f"{rows[bad][0].tolist()} at step {int(np.argmax(bad))}"
-            raise errors.UsageError(text, "finite numbers", where)
+            raise errors.UsageError(f"column {text}", "finite numbers", where)
         parts.append(rows)
     entries = np.concatenate(parts, -1)
     if count and entries.shape[1] != count:

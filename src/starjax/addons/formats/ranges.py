@@ -25,8 +25,8 @@ class Jaws:
     def add(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Takes the columns of an episode."""
         for i, arm in enumerate(self._arms):
-            if arm.gripper:
-                raw = maps.pick(arrays, arm.gripper, 1)
+            for columns in filter(None, (arm.gripper, arm.command_gripper)):
+                raw = maps.pick(arrays, columns, 1)
                 share = (raw - arm.gripper_closed) / (arm.gripper_open - arm.gripper_closed)
                 self._low[i] = min(self._low[i], share.min())
                 self._high[i] = max(self._high[i], share.max())

@@ -96,6 +96,7 @@ def survey(
         expected = "steps per second, which the files do not say"
         raise errors.UsageError("--map: hz", expected, "none", hint)
     kept, tips, commands, notes = [], [], [], list(labels.doubts(mapping, source))
+    notes += timing.of_rates(source.hz, mapping.hz)
     ends: list[float] = []
     jaws, joints = ranges.Jaws(mapping.arms), ranges.Joints(mapping.arms, folder)
     first_error: errors.UsageError | None = None
@@ -134,7 +135,8 @@ def survey(
     commands = list(itertools.compress(commands, is_known))
     if not kept:
         reason = notes[-1] if notes else "no episode"
-        raise errors.UsageError("PATH", "demonstrations to keep", reason)
+        hint = "; ".join(labels.doubts(mapping, source))
+        raise errors.UsageError("PATH", "demonstrations to keep", reason, hint)
     for k, (R, p), place in zip(kept, commands, places):
         notes += [f"episode {k.episode}: {x}" for x in doubts.off_trocar(R, p, place, mapping)]
     is_placed = mapping.place == "trocar"
@@ -144,8 +146,10 @@ def survey(
     kept = [k._replace(trocar=int(group)) for k, group in zip(kept, groups)]
     numbers = [k.episode for k in kept]
     residual = trocars.residual(tips, centres[groups], numbers, notes)
+    column = ", ".join(maps.listed(mapping.success))
+    if min(ends) < 0.0 or max(ends) > 1.0:
+        notes.append(f"{column} ends from {min(ends):.3g} to {max(ends):.3g}: is it a success?")
     if not any(k.success for k in kept):
-        column = ", ".join(maps.listed(mapping.success))
         most = f": {column} ends at {max(ends):.3g} or less, above 0.5 counts" if column else ""
         notes.append(f"no episode is a success{most}")
     notes += [

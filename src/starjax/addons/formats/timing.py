@@ -18,6 +18,7 @@ from starjax.core import errors
 APART = 0.1  # s, by which clocks of one episode may differ
 MAX_GAP_S = 0.5  # s without a value, unless a mapping says more
 _RATE = 0.05  # relative, by which a rate may differ from a declared one
+MOST_APART = (1.0 + _RATE) * APART  # s between the values of a stream that needs no note
 _HZ = 30.0  # for every dataset: faster steps lose nothing
 _PERIODS = 3.0  # periods of a stream, after which its value is old
 _ROUND = 1e-6  # s, of stamps that are sums of seconds and nanoseconds
@@ -140,6 +141,12 @@ def anomalies(source: Source, episode: int, arrays: Mapping[str, np.ndarray]) ->
         return [*clocked.notes, str(gap)]
 
 
+def of_rates(files_hz: float, hz: float) -> list[str]:
+    """Returns a note if the files and a mapping declare different rates, 0 for none."""
+    is_same = not (files_hz and hz) or abs(hz / files_hz - 1.0) <= _RATE
+    return [] if is_same else [f"the files declare {files_hz:g} Hz, the mapping {hz:g} Hz"]
+
+
 def of_steps(times: np.ndarray, hz: float, max_gap_s: float, is_strict: bool = True) -> list[str]:
     """Returns notes on rates and gaps of an episode's steps.
 
@@ -173,6 +180,8 @@ def of_steps(times: np.ndarray, hz: float, max_gap_s: float, is_strict: bool = T
         notes.append(
             f"its times show {1.0 / usual:.3g} Hz, the declared rate is {hz:g} Hz{question}"
         )
+    if usual > MOST_APART:
+        notes.append(f"its steps are {usual:.2g} s apart; filled in")
     if count := int((steps > 1.5 * usual).sum()):
         notes.append(f"{count} gaps, the longest of {steps[most]:.2f} s; filled in")
     return notes

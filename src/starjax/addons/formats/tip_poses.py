@@ -141,6 +141,8 @@ def rotations(numbers: np.ndarray, kind: maps.Turned) -> np.ndarray:
             raise errors.UsageError("rotation", "unit quaternions", got)
         xyzw = numbers if kind == "quat_xyzw" else numbers[:, [1, 2, 3, 0]]
         return transform.Rotation.from_quat(xyzw).as_matrix()
+    if kind in ("rotvec", "euler_xyz") and (most := float(np.abs(numbers).max())) > _TURNS:
+        raise errors.UsageError("rotation", "angles in rad", f"{most:.4g}: are they degrees?")
     if kind == "rotvec":
         return transform.Rotation.from_rotvec(numbers).as_matrix()
     if kind == "euler_xyz":
