@@ -79,7 +79,7 @@ def pages() -> Iterator[tuple[Path, str]]:
     marked = [ROOT / "README.md", ROOT / "benchmarks" / "README.md", HERE / "README.md"]
     for page in [*marked, *sorted((ROOT / "docs").rglob("*.md"))]:
         yield page, redraw(page.read_text(), table)
-    for file in sorted((packaged.CHECKOUT / packaged.PACKAGE).glob("*.safetensors")):
+    for file in map(packaged.locate, packaged.names()):
         result = model_card.find_result(file)
         yield file.with_suffix(".md"), model_card.text(file.stem, policy_file.load(file), result)
 

@@ -1,4 +1,4 @@
-"""Trained policies by name, of the distribution `starjax-weights`, and encoders of starjax itself.
+"""Trained policies by name: one of starjax itself, the others of `starjax-weights`.
 
 <name>.safetensors           in half precision, by `starjax pack`
 <name>.monitor.json          its runtime monitor, in place of the one in the weights
@@ -20,7 +20,7 @@ FOLDER = Path(__file__).with_name("weights")
 PACKAGE = "starjax_weights"
 CHECKOUT = Path(__file__).parents[3] / "weights"
 # Policies of the core's tasks; those of add-ons' tasks are in their tables.
-CORE = ("compact", "needle_pick", "peg_transfer_bimanual", "peg_transfer_robust")
+CORE = ("compact", "demo", "needle_pick", "peg_transfer_bimanual", "peg_transfer_robust")
 _SUFFIX = ".safetensors"
 _INSTALL = "in a checkout of starjax: pip install -e ./weights"
 
