@@ -83,7 +83,8 @@ def is_flags(kind: object, module: str) -> bool:
 
 def commands() -> str:
     """Returns a section per command, with its flags."""
-    parts = []
+    parts: list[str] = []
+    seen: dict[tuple[str, str], str] = {}  # (flag, help) -> the first command with it
     for name, (module, summary, _) in cli.COMMANDS.items():
         module, _, function = module.partition(":")
         loaded = importlib.import_module(module)
@@ -96,9 +97,24 @@ def commands() -> str:
             parts += ["", "Flags: the [settings of a run](config.md)."]
         elif flags_of:
             lines = rows(flags_of[0], flags_of[0])
-            lines = [(f"`{flag}`", *rest) for flag, *rest in lines]
-            parts += ["", table(["flag", "default", "meaning"], lines)]
+            own = [line for line in lines if seen.setdefault(line[::2], name) == name]
+            if own:
+                drawn = [(f"`{flag}`", *rest) for flag, *rest in own]
+                parts += ["", table(["flag", "default", "meaning"], drawn)]
+            parts += shared(seen, [line for line in lines if line not in own])
     return "\n".join(parts) + "\n"
+
+
+def shared(seen: dict[tuple[str, str], str], lines: list[tuple[str, str, str]]) -> list[str]:
+    """Returns a line per earlier command that explains some of a command's flags."""
+    by_command: dict[str, list[str]] = {}
+    for flag, value, text in lines:
+        word = f"`{flag} {value}`" if value else f"`{flag}`"
+        by_command.setdefault(seen[flag, text], []).append(word)
+    return [
+        f"\nAs in [{name}](#starjax-{name}): {', '.join(flags)}."
+        for name, flags in by_command.items()
+    ]
 
 
 def settings() -> str:
