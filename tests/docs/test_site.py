@@ -8,6 +8,8 @@ import urllib.parse
 
 import pytest
 
+FILM = re.compile(r"^\[[^\]]*\]\(\S+\.mp4\)$", re.MULTILINE)
+RATE = re.compile(r"<td([^>]*)>[^<]*\d+/\d+: [\d.]+% \(")
 HREF = re.compile(r'(?:href|src)="([^"#?]+)[^"]*"')
 
 
@@ -36,10 +38,25 @@ def test_links_of_the_site_lead_somewhere(site):
 @pytest.mark.slow
 def test_search_films_equations_and_examples_are_there(site, pytestconfig):
     assert (site / "search" / "search_index.js").exists()  # read by pages without a server
-    assert "<video" in (site / "index.html").read_text()
+    sources = [
+        *pytestconfig.rootpath.glob("docs/**/*.md"),
+        *pytestconfig.rootpath.glob("experiments/*/*.md"),
+    ]
+    films = sum(len(FILM.findall(page.read_text())) for page in sources)
+    texts = [page.read_text() for page in site.rglob("*.html")]
+    assert sum(text.count("<video") for text in texts) == films > 3
+    assert not any(re.search(r'href="[^"]*\.mp4"', text) for text in texts)
     assert "<math" in (site / "understand" / "wrist.html").read_text()
     examples = {file.stem for file in pytestconfig.rootpath.glob("examples/*.py")}
     assert {page.stem for page in (site / "examples").glob("*.html")} == examples
+
+
+@pytest.mark.slow
+def test_intervals_are_in_cells_that_do_not_break(site):
+    style = (site / "site.css").read_text()
+    assert re.search(r'td\[style\*="right"\] \{ white-space: nowrap; \}', style)
+    cells = [cell for page in site.rglob("*.html") for cell in RATE.findall(page.read_text())]
+    assert len(cells) > 300 and all("right" in cell for cell in cells)
 
 
 @pytest.mark.slow
