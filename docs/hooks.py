@@ -27,7 +27,6 @@ IMAGES = (".png", ".gif")
 # Page of the site -> file of its text.
 COPIES = {
     "changelog.md": "CHANGELOG.md",
-    "contributing.md": "CONTRIBUTING.md",
     "reference/benchmarks.md": "benchmarks/README.md",
     "reference/mjcf.md": "mjcf/README.md",
     "results/index.md": "experiments/README.md",
