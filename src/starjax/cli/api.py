@@ -20,7 +20,8 @@ from starjax.sim.state import Env
 def load_policy(policy: str | Path, env: Env | None = None) -> PolicyInEnv:
     """Loads a trained policy into an environment.
 
-    >>> starjax.load_policy("runs/cpu/stardiff/policy.safetensors")
+    Examples:
+      >>> starjax.load_policy("runs/cpu/stardiff/policy.safetensors")
 
     Args:
       policy: a policy.safetensors, or a name of `starjax list`.
@@ -42,8 +43,9 @@ def load_policy(policy: str | Path, env: Env | None = None) -> PolicyInEnv:
 def train(settings: RunConfig, folder: str | Path) -> Path:
     """Records the expert's demonstrations and trains a policy on them, as `starjax train` does.
 
-    >>> starjax.train(starjax.PRESETS["smoke"], "runs/mine")
-    PosixPath('runs/mine/stardiff/policy.safetensors')
+    Examples:
+      >>> starjax.train(starjax.PRESETS["smoke"], "runs/mine")
+      PosixPath('runs/mine/stardiff/policy.safetensors')
 
     Called again with the same arguments it resumes, or returns at once.
 
@@ -65,8 +67,9 @@ def evaluate(
 ) -> dict[str, Any]:
     """Scores a policy in closed loop at all trocars of its task, as one program.
 
-    >>> figures = starjax.evaluate(policy, trials=1)
-    >>> figures["unseen"]
+    Examples:
+      >>> figures = starjax.evaluate(policy, trials=1)
+      >>> figures["unseen"]
 
     Args:
       policy: from `load_policy`.
