@@ -94,7 +94,7 @@ def commands() -> str:
         parts += ["", f"## starjax {name}", "", text.partition("\n\n")[0]]
         parts += ["", "```bash", *map(str.strip, examples.splitlines()), "```"]
         if name in ("run", "collect", "train"):
-            parts += ["", "Flags: the [settings of a run](config.md)."]
+            parts += ["", "Flags: the [settings of a run](config.md)."] * (name == "run")
         elif flags_of:
             lines = rows(flags_of[0], flags_of[0])
             own = [line for line in lines if seen.setdefault(line[::2], name) == name]
