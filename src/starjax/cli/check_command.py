@@ -69,7 +69,7 @@ def resolve(words: Sequence[str]) -> tuple[str, str]:
     found = [kind for kind, row in known.items() if name in row.names()]
     if not found:
         names = [each for row in known.values() for each in row.names()]
-        hint = errors.nearest(name, names) or "starjax list shows all"
+        hint = errors.nearest(name, names) or "starjax list shows all; is its package installed?"
         raise errors.UsageError("NAME", "a part's name", repr(name), hint)
     if len(found) > 1:
         kinds_of = " or ".join(f"{kind} {name}" for kind in found)
