@@ -18,6 +18,7 @@ from starjax.addons.finetune import dagger
 from starjax.addons.finetune.commands import (
     finetune,
     finetune_checks,
+    finetune_page,
     finetune_stages,
     finetune_work,
 )
@@ -86,6 +87,8 @@ def file(tmp_path, monkeypatch):
     monkeypatch.setattr(in_env.policies, "make", lambda *_, **__: POLICY)
     times = {"p50": 1.0, "p95": 1.0, "p99": 1.0}
     monkeypatch.setattr(policy_evaluation, "inference_ms", lambda *_: times)
+    # The stub's arm has no scene to draw.
+    monkeypatch.setattr(finetune_page, "write", lambda out, content: out / str(content["best"]))
     rescuers = Registry("rescuer", {"reach": "stubs:RESCUER"})
     monkeypatch.setattr(registries, "rescuers", rescuers)
     monkeypatch.chdir(tmp_path)
