@@ -68,7 +68,7 @@ class Report:
       refused: replies without a valid plan.
       fault: reason of the last silence, loss or refusal.
       lost: connections that broke, or replies that timed out.
-      overran: control periods of `Client.run` that took too long.
+      overran: periods of the loop that took too long.
       alarms: of the policy's runtime monitor; `alarm` describes the last one.
       latencies: of every plan, from the request to its arrival.
     """

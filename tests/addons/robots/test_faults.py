@@ -109,14 +109,17 @@ def test_a_wrong_instrument_is_found_before_anything_is_sent(own_bus, tmp_path):
         assert one.sent == 0 and process.end()["commands"] == 0
 
 
-def test_a_wrong_base_is_found_by_the_setpoint(own_bus, tmp_path):
+def test_a_wrong_base_is_found_by_the_setpoint(own_bus, tmp_path, monkeypatch):
     """Measurements agree in any base; the robot's own setpoint does not."""
     with robot() as process, made(own_bus, file_of(tmp_path)) as (one, client, _):
         command = client.step(one.measure())
         assert one.check_first(command) == []
         aside = command._replace(pose=command.pose._replace(p=command.pose.p + 0.01))
         (doubt,) = one.check_first(aside)
-        assert doubt.name == "first command" and one.sent == 0
+        assert doubt.name == "first command"
+        monkeypatch.setattr(one, "check_first", lambda command: [doubt])
+        report = node.run(one, client, 1.0)
+        assert report.fault == str(doubt) and report.silent == 1 and one.sent == 0
         process.end()
 
 
@@ -138,12 +141,16 @@ def test_a_second_node_is_refused_and_disturbs_nobody(own_bus, tmp_path):
         process.end()
 
 
-def test_a_command_out_of_reach_is_not_sent(own_bus, tmp_path):
+def test_a_command_out_of_reach_is_not_sent(own_bus, tmp_path, monkeypatch):
     with robot() as process, made(own_bus, file_of(tmp_path)) as (one, client, _):
         command = client.step(one.measure())
         deep = command._replace(pose=command.pose._replace(p=command.pose.p - [0.0, 0.0, 0.2]))
         with mistakes.of("outer_insertion"):
             one.send(deep)
+        far = one.kinematics._replace(joints_of=lambda pose, near: near + 0.21)
+        monkeypatch.setattr(one, "kinematics", far)
+        report = node.run(one, client, 1.0)
+        assert report.fault.startswith("out of reach: joints") and report.silent == 1
         assert one.sent == 0
         process.end()
 

@@ -147,6 +147,8 @@ def test_commands_between_two_lie_on_the_manifold():
         ('[arm]\nnamespace = "/PSM1"\n[topics]\nposes = "/measured"', "topics.poses"),
         ('[arm]\nnamespace = "/PSM1"\n[network]\nuse_sim_time = 1', "network.use_sim_time"),
         ('[arm]\nnamespace = "/PSM1"\nposition = [14.0, 14.0, 153.0]', "arm.position"),
+        ('[arm]\nnamespace = "/PSM1"\nposition = ["a", 0, 0]', "arm.position"),
+        ('[arm]\nnamespace = "/PSM1"\n[network]\npeers = [1]', "network.peers"),
         ('[arm]\nnamespace = "/PSM1"\nquaternion_xyzw = [0, 0, 0, 2]', "arm.quaternion_xyzw"),
         ('[arm]\nnamespace = "/PSM1"\nspeed = 1', "arm.speed"),
         ("[arm]", "arm.namespace"),

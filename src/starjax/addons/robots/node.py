@@ -29,9 +29,16 @@ def tolerances(file: RobotFile, is_dry: bool = False) -> guard.Tolerances:
 
 
 def doubts(arm: CrtkArm, client: Client) -> list[guard.Doubt]:
-    """Returns the doubts about an arm that its `Client` does not see: state, commanders, joints."""
+    """Returns the doubts about an arm that its `Client` does not see: state, commanders, joints.
+
+    A message that cannot be read is one: it names another frame or other joints, or is no image.
+    """
     now, where = arm.bus.now(), client.p_world_trocar
-    found = guard.check(arm.snapshot(now), (), where, now, tolerances(arm.file))
+    try:
+        snapshot = arm.snapshot(now)
+    except UsageError as error:
+        return [guard.Doubt("arm", "message", str(error)), *arm.reports()]
+    found = guard.check(snapshot, (), where, now, tolerances(arm.file))
     if missing := arm.missing():
         found.append(guard.Doubt("arm", "topics", f"no message of {', '.join(missing)}"))
     return [doubt for doubt in found if doubt.kind == "arm"] + arm.reports()
@@ -73,12 +80,12 @@ def run(
     period, due, last = 1.0 / arm.file.arm.rate, arm.bus.now(), None
     for _ in range(round(seconds * client.control_hz)):
         arm.poll()
-        if bad := doubts(arm, client):
-            client.stop(str(bad[0]))
-        command = None if arm.missing() else client.step(arm.measure())
-        first = [] if command is None or last else arm.check_first(command)
-        if first and not is_dry:
-            client.stop(str(first[0]))
+        bad = doubts(arm, client)
+        command = None if bad else client.step(arm.measure())
+        if command is not None and last is None and not is_dry:
+            bad = arm.check_first(command)
+        if bad:
+            _stop(client, str(bad[0]))
             command = None
         if command is not None:
             shown.show(command, client)
@@ -87,10 +94,12 @@ def run(
                     try:
                         arm.send(one)
                     except UsageError as error:
-                        client.stop(f"out of reach: {error}")
+                        _stop(client, f"out of reach: {error}")
                         command = None
                         break
-                due = max(due + period, arm.bus.now() - period)  # lost periods are not made up for
+                now, due = arm.bus.now(), due + period
+                client.report.overran += now > due
+                due = max(due, now - period)  # lost periods are not made up for
                 arm.bus.wait(due)
         last = command
         if command is None:
@@ -105,6 +114,11 @@ def run(
         elif should_stop():
             break
     return client.report
+
+
+def _stop(client: Client, fault: str) -> None:
+    client.stop(fault)
+    client.report.silent += 1
 
 
 class Shown:

@@ -90,7 +90,10 @@ def main(argv: Sequence[str]) -> int:
             confirm=(lambda reason: False) if args.begin else _ask,
             should_stop=should_stop,
         )
-    print(f"{report.steps} commands of {report.plans} plans, {report.held} held, {arm.sent} sent")
+    print(
+        f"{report.steps} commands of {report.plans} plans, {report.held} held, {arm.sent} sent, "
+        f"{report.overran} of them late"
+    )
     if report.fault:
         print(report.fault)
     return int(bool(report.silent))

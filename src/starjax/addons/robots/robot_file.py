@@ -4,7 +4,7 @@ import dataclasses
 import json
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -204,8 +204,10 @@ def _table(path: str | Path, name: str, kind: type, values: Any) -> Any:
             not isinstance(value, kinds) or isinstance(value, bool) is not (kinds is bool)
         ):
             raise UsageError(f"{path}: {name}.{key}", expected[fields[key].type], repr(value))
-        if fields[key].type not in expected and not isinstance(value, list):
-            raise UsageError(f"{path}: {name}.{key}", "a list", repr(value))
+        for item in get_args(fields[key].type)[:1]:
+            kinds, of = ((int, float), "numbers") if item is float else (item, "texts")
+            if not (isinstance(value, list) and all(isinstance(x, kinds) for x in value)):
+                raise UsageError(f"{path}: {name}.{key}", f"a list of {of}", repr(value))
     for key, field in fields.items():
         if field.default is dataclasses.MISSING and key not in values:
             raise UsageError(f"{path}: {name}.{key}", "a value", "none")
