@@ -25,6 +25,7 @@ from starjax.deploy.connection import Connection
 
 LOOP_S = 10.0  # time of the robot
 DOMAIN = 62  # of DDS; tests have those from 64 on
+START_S = 300.0  # for the robot's process
 LOST_S = 0.5  # after which a command counts as lost: another has replaced it
 
 
@@ -58,12 +59,16 @@ def topics(calls: int) -> dict:
     argv = [sys.executable, "-m", "starjax", "sim-robot", "--domain", str(DOMAIN)]
     simulated = subprocess.Popen(argv, stdout=subprocess.DEVNULL)
     own, times, periods = bus.Bus(robot_file.Network(DOMAIN, "lo")), [], []
-    own.read("/PSM1/setpoint_js", messages.JointState)
-    own.read("/PSM1/measured_js", messages.JointState)
+    names = "/PSM1/setpoint_js", "/PSM1/measured_js"
+    for name in names:
+        own.read(name, messages.JointState)
     try:
-        end = time.perf_counter() + 60.0
-        while "/PSM1/setpoint_js" not in own.newest and time.perf_counter() < end:
+        end = time.perf_counter() + START_S
+        while not set(names) <= set(own.newest):
+            if time.perf_counter() > end:
+                raise SystemExit("starjax sim-robot: no topics")
             own.poll()
+            time.sleep(0.01)
         writer = own.writer("/PSM1/servo_jp", messages.JointState, "servo")
         q = np.array(own.newest["/PSM1/measured_js"].position)
         time.sleep(1.0)  # readers and writers find each other
