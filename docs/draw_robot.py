@@ -59,7 +59,7 @@ def main() -> None:
     }.items():
         parser.add_argument(f"--{name}", default=value)
     parser.add_argument("--seed", type=int, default=0, help="of the objects' places")
-    parser.add_argument("--seconds", type=float, default=12.0, help="of the robot's clock")
+    parser.add_argument("--seconds", type=float, default=11.0, help="of the robot's clock")
     args = parser.parse_args()
     moments, end = record(args)
     print(f"{len(moments)} pictures, {moments[-1].time - moments[0].time:.1f} s, {end}")
@@ -123,7 +123,7 @@ def draw(moments: list[Moment], end: str = "") -> np.ndarray:
     x, y = pixel(ball.pose.position)
     color = tuple(round(255 * part) for part in (ball.color.r, ball.color.g, ball.color.b))
     pen.ellipse([x - 4, y - 4, x + 4, y + 4], color)
-    text = last.shown.markers[-1].text
+    text = "" if end else last.shown.markers[-1].text
     at = end or f"{last.time - moments[0].time:.1f} s"
     rows = [
         [(at, "#e6e9ec"), (text, "#e6e9ec")],

@@ -19,8 +19,16 @@ from starjax.addons.robots import (
     bus,
     messages,
     node,
+    psm,
     topic_table,
 )
+
+
+def until(holds, seconds=60.0):
+    end = time.monotonic() + seconds
+    while not (is_so := holds()) and time.monotonic() < end:
+        time.sleep(0.002)
+    return is_so
 
 
 @pytest.mark.parametrize(
@@ -75,12 +83,6 @@ def test_a_killed_node_leaves_an_arm_that_holds_and_a_second_begins(own_bus, tmp
         own_bus.poll()
         message = own_bus.newest.get(f"/PSM1/{name}")
         return HOME if message is None else np.array(message.position)
-
-    def until(holds, seconds=60.0):
-        end = time.monotonic() + seconds
-        while not (is_so := holds()) and time.monotonic() < end:
-            time.sleep(0.002)
-        return is_so
 
     with robot() as process:
         first = subprocess.Popen([sys.executable, "-c", code])
@@ -165,3 +167,25 @@ def test_a_topic_without_a_writer_is_named(own_bus, tmp_path):
     assert "/PSM9/measured_js" in topic_table.text(rows)
     with mistakes.of("robot"):
         one.measure()
+
+
+def test_a_simulated_arm_refuses_joints_beyond_their_limits_and_leaves_its_last_message(own_bus):
+    joints, text = messages.JointState, messages.StringStamped
+    own_bus.read("/PSM1/measured_js", joints)
+    own_bus.read("/PSM1/warning", text)
+    for topic in ("/PSM1/measured_js", "/PSM1/warning"):
+        own_bus.newest.pop(topic, None)
+    writer = own_bus.writer("/PSM1/servo_jp", joints, "servo")
+    with robot() as process:
+        deep = HOME + np.eye(6)[2]  # 1 m of insertion
+
+        def is_refused():
+            writer.write(joints(messages.Header(), list(psm.JOINTS), deep.tolist()))
+            return "/PSM1/warning" in own_bus.poll()
+
+        assert until(is_refused)
+        assert "within their limits" in own_bus.newest["/PSM1/warning"].string
+        told = process.end()
+        assert told["commands"] == 0 and np.abs(np.array(told["q"]) - HOME).max() == 0.0
+        until(lambda: own_bus.poll() and False, 0.5)
+        assert len(own_bus.newest["/PSM1/measured_js"].position) == 6
