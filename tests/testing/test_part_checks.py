@@ -48,7 +48,7 @@ ROW = methods.METHODS["dp_rcm4"]
     ],
 )
 def test_methods(monkeypatch, row, expected):
-    monkeypatch.setitem(methods.METHODS.registry.built_in, "mine", row)
+    monkeypatch.setitem(methods.METHODS.registry.built_in, "mine", row._replace(label="mine"))
     assert faults(method_checks.check("mine", 1)) == expected
 
 
@@ -198,7 +198,7 @@ class Still:
         ("raises", "plan", base.FAILED),
         ("lengths", "calls", base.FAILED),
         ("memory", "repeatable", base.NOTE),
-        ("far", "first command", base.NOTE),
+        ("far", "command", base.FAILED),
     ],
 )
 def test_policies(monkeypatch, fault, subject, status):

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from starjax import rcm, testing
+from starjax.cli.presets import PRESETS
 from starjax.core.learners import Learner
+from starjax.core.methods import Method
 from starjax.evaluation.disturbances import DISTURBANCES
 from starjax.evaluation.expert import ExpertEpisodes
 from starjax.policies.external import ExternalPolicy
@@ -163,6 +165,8 @@ def linear(fault=""):
 
         def loss(params, condition, x0):
             error = jnp.mean((predict(params, condition) - x0) ** 2)
+            if fault == "loss of one step":
+                error = jnp.mean((predict(params, condition) - x0)[:, 0] ** 2)
             if fault == "no target":
                 error = jnp.mean(predict(params, condition) ** 2)
             return -error if fault == "away from the target" else error, {}
@@ -187,6 +191,7 @@ LEARNERS = {
     "no target": "training, of images",
     "away from the target": "training, of images",
     "samples at rest": "training, of images",
+    "loss of one step": "training, of images",
     "in mm": "samples, of images",
 }
 
@@ -213,6 +218,12 @@ class Pooled(nn.Module):
         """Returns maps `[N, h / 4, w / 4, width]`."""
         if self.fault == "all":
             image = 0.0 * image
+        if self.fault == "order of colours":
+            image = jnp.broadcast_to(image.mean(-1, keepdims=True), image.shape)
+        if self.fault == "side to side":
+            image = image + image[:, :, ::-1]
+        if self.fault == "even":
+            image = image / image.std((1, 2, 3), keepdims=True)
         if self.fault == "channel 2":
             image = image.at[..., 2].set(0.0)
         if self.fault == "lower right":
@@ -221,12 +232,16 @@ class Pooled(nn.Module):
         return nn.Conv(self.width, (4, 4), (4, 4), dtype=self.dtype)(image.astype(self.dtype))
 
 
-@pytest.mark.parametrize("fault", ["", "all", "channel 2", "lower right"])
+SEEN = ["", "all", "channel 2", "lower right", "order of colours", "side to side", "even"]
+
+
+@pytest.mark.parametrize("fault", SEEN)
 def test_encoders(fault):
     made = Trunk(lambda width, dtype, name=None: Pooled(width, dtype, fault, name=name), 16, 4)
     wrong = found("encoder", made)
-    assert ("input" in wrong) == bool(fault), wrong
-    assert (fault if fault != "all" else "channel 0") in wrong.get("input", "")
+    subject = "features" if fault == "even" else "input"
+    assert (subject in wrong) == bool(fault), wrong
+    assert (fault if fault != "all" else "channel 0") in wrong.get(subject, "")
 
 
 # Policies.
@@ -245,9 +260,13 @@ def row_of(fault):
             row[7] = 60.0
         if fault == "blind":
             row[:3] = (0.0, 0.0, 0.05)
+        if fault == "relative":
+            row[:3] *= 0.01
         if fault == "exits":
             raise SystemExit(3)
-        return {"text": "go", "none": None}.get(fault, np.repeat(row[None], 2, 0))
+        rows = np.repeat(row[None], 2, 0)
+        rows[1, 7] = 60.0 if fault == "later gripper" else row[7]
+        return {"text": "go", "none": None}.get(fault, rows)
 
     return act
 
@@ -258,6 +277,8 @@ POLICIES = {
     "mm": "plan",
     "no rotation": "command",
     "gripper": "command",
+    "later gripper": "command",
+    "relative": "command",
     "blind": "input",
     "exits": "checks",
     "text": "plan",
@@ -307,14 +328,18 @@ ARMS = {
     "max_speed": (0.0,) * 6,
     "watched": None,
 }
-TOOLS = {
-    "shaft_radius": 4.0,
-    "shaft_reach": 100.0,
-    "pad_end": 2.5,
-    "closed": np.nan,
-    "shaft_end": np.nan,
-    "tcp": "nowhere",
-}
+TOOLS = [
+    ("shaft_radius", 4.0),
+    ("shaft_radius", 5e-4),
+    ("shaft_reach", 100.0),
+    ("pad_end", 2.5),
+    ("pad_end", 0.02),
+    ("closed", np.nan),
+    ("shaft_end", np.nan),
+    ("shaft_end", -0.05),
+    ("tcp", "nowhere"),
+    ("pads", ("pad_left", "pad_left")),
+]
 
 
 @pytest.mark.parametrize("field", ARMS)
@@ -323,13 +348,31 @@ def test_arms(field):
     assert found("arm", arm)
 
 
-@pytest.mark.parametrize("field", TOOLS)
-def test_tools(field):
-    tool = registries.tools.get("grasper")._replace(**{field: TOOLS[field]})
+@pytest.mark.parametrize(("field", "value"), TOOLS)
+def test_tools(field, value):
+    tool = registries.tools.get("grasper")._replace(**{field: value})
     assert found("tool", tool)
     with pytest.raises(AssertionError, match="grasper"):
         testing.check_tool(tool)
     assert registries.tools.get("grasper") is not tool
+
+
+# Methods, action spaces, presets.
+ROWS = {
+    "a word for a flag": ("method", Method("rcm4", label="mine", sees_trocar="no"), "record"),
+    "a number as label": ("method", Method("rcm4", label=7), "record"),
+    "a label of another": ("method", Method("rcm4", label="STAR-Diff"), "record"),
+    "absolute": ("action_space", rcm.ACTION_SPACES["rcm3"]._replace(is_absolute=True), "facts"),
+    "free": ("action_space", rcm.ACTION_SPACES["rcm4"]._replace(is_free=True), "facts"),
+    "turns": ("action_space", rcm.ACTION_SPACES["rcm4"]._replace(turns=("yaw",)), "record"),
+    "method": ("preset", dataclasses.replace(PRESETS["smoke"], method="nothing"), "method"),
+}
+
+
+@pytest.mark.parametrize("name", ROWS)
+def test_rows_that_contradict_themselves(name):
+    kind, part, subject = ROWS[name]
+    assert subject in found(kind, part)
 
 
 def test_a_sound_part_passes_by_name_and_by_record():

@@ -45,6 +45,7 @@ def check(name: str, n: int) -> Iterator[Check]:
     key = jax.random.key(1)
     drawn = decode(jax.random.uniform(key, (COUNT, space.dim), minval=-1.0), trocar)
     yield verdict("any action", _unsound(drawn, True), "finite poses with rotations")
+    yield verdict("facts", _facts(space, decode, trocar), "of the record")
     if not space.is_free:
         yield verdict("manifold", _misses(space, drawn[0], trocar), "shafts pass the trocar")
     far = decode(jnp.full((COUNT, space.dim), LARGE), trocar)
@@ -58,6 +59,9 @@ def _parts(space: ActionSpace) -> Iterator[str]:
     taken = sorted(i for part in space.slices.values() for i in range(*part.indices(space.dim)))
     if taken != list(range(space.dim)):
         yield f"slices: expected 0 to {space.dim - 1}, each once, got {taken}"
+    for part in space.turns:
+        if part not in space.slices:
+            yield f"turns: expected parts of {', '.join(space.slices)}, got {part}"
     sizes = {"R": 6, "p": 3, "depth": 1, "roll": 1, "wrist": 2}
     for part, size in sizes.items():
         if part in space.slices and len(range(*space.slices[part].indices(space.dim))) != size:
@@ -76,6 +80,16 @@ def _poses() -> tuple[Pose, rcm.TrocarFrame]:
     )
     rolls = jax.random.uniform(keys[2], (COUNT,), minval=space.rolls[0], maxval=space.rolls[1])
     return Pose(rcm.rotation_from_axis_roll(tips - frame.p_world_trocar, rolls), tips), frame
+
+
+def _facts(space: ActionSpace, decode: Any, trocar: rcm.TrocarFrame) -> Iterator[str]:
+    """Yields facts of the record that decoded actions contradict."""
+    action = jax.random.uniform(jax.random.key(2), (COUNT, space.dim), minval=-0.1, maxval=0.1)
+    (pose, _), (other, _) = decode(action, trocar), decode(action[::-1], trocar)
+    if space.is_absolute and (away := float(np.abs(pose.p - other.p[::-1]).max())) > TOLERANCE:
+        yield f"is_absolute: another trocar moves the tip of an action by {1e3 * away:.2g} mm"
+    if space.is_free and float(np.max(rcm.rcm_error(pose, trocar.p_world_trocar))) <= MAX_ERROR:
+        yield "is_free: every shaft passes the trocar"
 
 
 def _types(space: ActionSpace, action: jax.Array, decoded: Any) -> Iterator[str]:

@@ -10,7 +10,7 @@ from starjax.sim import scene as scenes
 from starjax.sim.arms.base import Arm
 from starjax.testing.base import FAILED, NOTE, Check, attempt, not_finite, outside, verdict
 
-RANGES = {"max_speed": (1e-3, 50.0), "servo_frequency": (1.0, 2e3), "link_radius": (1e-3, 0.3)}
+RANGES = {"max_speed": (0.05, 50.0), "servo_frequency": (5.0, 2e3), "link_radius": (1e-3, 0.3)}
 HOLD_S = 1.0
 MAX_SAG = 1e-4  # m that the tip may move in `HOLD_S`
 

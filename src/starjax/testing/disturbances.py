@@ -35,6 +35,9 @@ FIELDS = (
     "success",
     "loose",
     "collided",
+    "step",
+    "lost",
+    "invalid",
 )
 
 

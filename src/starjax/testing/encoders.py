@@ -71,7 +71,7 @@ def _maps(maps: Any) -> Iterator[str]:
 
 
 def _unseen(apply: Callable[..., Any], params: ArrayTree, images: jax.Array) -> Iterator[str]:
-    """Yields the channels and quarters of an image that change no feature."""
+    """Yields the channels, quarters and orders of an image that change no feature."""
     before, half = np.asarray(apply(params, images[:1])), images.shape[1] // 2
     slices = {"upper": slice(0, half), "lower": slice(half, None)}
     parts: dict[str, Any] = {
@@ -80,8 +80,9 @@ def _unseen(apply: Callable[..., Any], params: ArrayTree, images: jax.Array) -> 
     for y, rows in slices.items():
         for x, columns in zip(("left", "right"), slices.values()):
             parts[f"{y} {x} quarter"] = (slice(None), rows, columns)
-    for name, part in parts.items():
-        changed = images[:1].at[part].set(images[1:][part])
+    changes = {name: images[:1].at[part].set(images[1:][part]) for name, part in parts.items()}
+    changes |= {"order of colours": images[:1, ..., ::-1], "side to side": images[:1, :, ::-1]}
+    for name, changed in changes.items():
         if (moved := float(np.abs(np.asarray(apply(params, changed)) - before).max())) < SEEN:
             yield f"{name} changes the features by {moved:.2g}, expected {SEEN:g} or more"
 
@@ -94,8 +95,8 @@ def _values(encoder: Any, images: jax.Array, reads_depth: bool = False) -> Itera
         return
     apply = jax.jit(encoder.apply)
     both, alone = apply(params, images), apply(params, images[:1])
-    if not np.isfinite(both).all():
-        yield failed("features", "not finite")
+    if not (np.isfinite(both).all() and np.isfinite(apply(params, 0.0 * images)).all()):
+        yield failed("features", "not finite, of random or of even images")
         return
     apart = float(np.abs(both[:1] - alone).max())
     mixed = [f"an image's features depend on its batch, by {apart:.2g}"] * (apart > TOLERANCE)

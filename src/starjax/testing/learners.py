@@ -97,6 +97,8 @@ def _values(text: str, model: SequenceModel, sizes: Sizes) -> Iterator[Check]:
     faults = list(_unlearned(losses, error))
     if not other > own:
         faults.append(f"the loss is {own:.3g} for learned sequences and {other:.3g} for others")
+    value = jax.jit(lambda x: model.loss(params, condition, model.prepare(keys[0], x))[0])
+    faults += _ignored(value, x0)
     yield verdict(f"training, {text}", faults, figures)
     blind = _blind(functools.partial(drawn, trained), condition)
     yield verdict(f"input, {text}", blind, "samples follow it")
@@ -135,6 +137,16 @@ def _unlearned(losses: np.ndarray, error: float) -> Iterator[str]:
     if not error < 1.0 - NEARER:
         text = f"{error:.2f} of the mean action's, expected below {1.0 - NEARER:.2f}"
         yield f"the samples' error after {STEPS} steps is {text}"
+
+
+def _ignored(loss: Callable[[jax.Array], jax.Array], x0: jax.Array) -> Iterator[str]:
+    """Yields the steps and actions of sequences `[B, H, D]` that a loss ignores."""
+    own = float(loss(x0))
+    for axis, name in ((1, "steps"), (2, "actions")):
+        sizes = [x0.shape[axis] if i == axis else 1 for i in range(x0.ndim)]
+        each = jnp.eye(x0.shape[axis]).reshape(-1, *sizes)
+        if same := [i for i, change in enumerate(each) if float(loss(x0 + change)) == own]:
+            yield f"the loss ignores {name} {', '.join(map(str, same))}"
 
 
 def _blind(drawn: Callable[[Condition], np.ndarray], condition: Condition) -> Iterator[str]:

@@ -27,7 +27,9 @@ def check(name: str, n: int) -> Iterator[Check]:
     if fault:
         yield fault
         return
-    yield Check("record", f"{row.label}: {row.action_space}, {_conditioning(row)}")
+    yield verdict(
+        "record", _fields(name, row), f"{row.label}: {row.action_space}, {_conditioning(row)}"
+    )
     yield verdict("weights", _weights(name, row), f"those of {row.weights_of}")
     if row.projects and normalizer.keeps_to_manifold(row._replace(projects=False)):
         yield Check("projects", f"{row.action_space} is on the manifold without it", NOTE)
@@ -39,6 +41,16 @@ def check(name: str, n: int) -> Iterator[Check]:
 def _conditioning(row: Method) -> str:
     kind = "hierarchical" if row.hierarchical else "one network"
     return f"{kind}, {'sees' if row.sees_trocar else 'without'} the trocar"
+
+
+def _fields(name: str, row: Method) -> Iterator[str]:
+    """Yields fields of another type than the defaults', and a label of another method."""
+    for field, default in Method._field_defaults.items():
+        if not isinstance(got := getattr(row, field), type(default)):
+            yield f"{field}: expected a {type(default).__name__}, got {got!r}"
+    for other in METHODS:
+        if other != name and METHODS[other].label == row.label:
+            yield f"label {row.label} is that of {other}"
 
 
 def _weights(name: str, row: Method) -> Iterator[str]:

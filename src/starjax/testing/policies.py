@@ -11,7 +11,6 @@ from starjax.testing.base import FAILED, NOTE, Check, attempt, failed, verdict
 
 FAR = 0.05  # m from the tip to the first command, beyond a step of any tool
 MOVED = 0.01  # m, by which the tips of another observation are away
-FARTHEST = 0.5  # m from the tip; no command of a policy in m is farther
 UNIT = 1e-2  # by which a quaternion's length, or a gripper, may be off
 TURNED = 1.0  # rad that a first command may turn the tip by
 IMAGE, STATE = "observation/image", "observation/state"
@@ -65,7 +64,8 @@ def check(name: str, n: int) -> Iterator[Check]:
         return
     first, moved, dark, again = plans
     tips = np.reshape(request[STATE], (-1, 8))
-    yield verdict("command", _commanded(first[0].reshape(-1, 8), tips), "a pose near the tip's")
+    faults = [*_commanded(first[0].reshape(-1, 8), tips), *_grippers(first)]
+    yield verdict("command", faults, "a pose near the tip's")
     if np.array_equal(first, moved) and np.array_equal(first, dark):
         yield failed("input", f"the plan is the same with tips {1e3 * MOVED:g} mm away")
     elif IMAGE in request and np.array_equal(first, dark):
@@ -73,9 +73,6 @@ def check(name: str, n: int) -> Iterator[Check]:
     if not np.array_equal(first, again):
         text = "one observation has several plans: draws or memory, which episodes share"
         yield Check("repeatable", text, NOTE)
-    away = float(np.linalg.norm(first[0].reshape(-1, 8)[:, :3] - tips[:, :3], axis=-1).max())
-    if away > FAR:
-        yield Check("first command", f"{1e3 * away:.0f} mm from the tip", NOTE)
 
 
 def _plans(connection: external.LocalConnection, request: dict[str, Any]) -> list[np.ndarray]:
@@ -100,9 +97,9 @@ def _changed(rng: np.random.Generator, name: str, value: Any) -> Any:
 def _commanded(rows: np.ndarray, tips: np.ndarray) -> Iterator[str]:
     """Yields faults of first commands `[A, 8]`, compared with the measured tips `[A, 8]`."""
     away = float(np.linalg.norm(rows[:, :3] - tips[:, :3], axis=-1).max())
-    if away > FARTHEST:
-        near = float(np.linalg.norm(1e-3 * rows[:, :3] - tips[:, :3], axis=-1).max())
-        yield f"{away:.3g} m from the tip" + ": are positions in mm?" * (near < FARTHEST)
+    if away > FAR:
+        added = float(np.linalg.norm(rows[:, :3], axis=-1).max())
+        yield f"{1e3 * away:.0f} mm from the tip" + ": relative to it?" * (added < FAR)
     lengths = np.linalg.norm(rows[:, 3:7], axis=-1)
     if (off := float(np.abs(lengths - 1.0).max())) > UNIT:
         yield f"quaternions of a length that is off by {off:.2g}"
@@ -111,7 +108,11 @@ def _commanded(rows: np.ndarray, tips: np.ndarray) -> Iterator[str]:
     if angle > TURNED:
         why = f", by {other:.2f} as wxyz: xyzw is expected" * (other < TURNED)
         yield f"the first command turns the tip by {angle:.2f} rad{why}"
-    if (largest := float(np.abs(rows[:, 7]).max())) > 1.0 + UNIT:
+
+
+def _grippers(plan: np.ndarray) -> Iterator[str]:
+    """Yields a fault of the grippers of a plan `[H, 8 A]`."""
+    if (largest := float(np.abs(plan[:, 7::8]).max())) > 1.0 + UNIT:
         yield f"a gripper at {largest:.3g}, expected -1 to 1"
 
 

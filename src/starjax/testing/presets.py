@@ -4,8 +4,8 @@ import dataclasses
 from collections.abc import Iterator
 
 from starjax.cli import checks, presets, scenes
-from starjax.core import config, config_json, limits
-from starjax.core.methods import TABLE_II
+from starjax.core import config, config_json, errors, limits
+from starjax.core.methods import METHODS, TABLE_II
 from starjax.testing.base import NOTE, Check, attempt, verdict
 
 
@@ -14,6 +14,8 @@ def check(name: str, n: int) -> Iterator[Check]:
     fault, preset = attempt("record", lambda: presets.PRESETS[name])
     if not fault:
         fault, _ = attempt("ranges", lambda: limits.check(preset))
+    if not fault:
+        fault, _ = attempt("method", lambda: errors.choice("method", preset.method, METHODS))
     if fault:
         yield fault
         return

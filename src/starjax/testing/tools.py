@@ -12,6 +12,8 @@ from starjax.sim.tools.base import Tool
 from starjax.testing.base import Check, attempt, not_finite, outside, verdict
 
 BEND = (0.5, -0.4)  # rad, pitch and yaw of a bent wrist
+APART = 1e-3  # m between sizes of the record and of the file
+ROUND = (mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_CYLINDER)
 NEAR, NEAR_TURN = 1e-5, 1e-4  # m, and of a rotation's entries
 RANGES = {
     "closed": (-2.0, 2.0),
@@ -40,6 +42,8 @@ def check(name: str, n: int) -> Iterator[Check]:
         if tool.wrist is not None and not missing:
             yield verdict("wrist", _wrist(tool, m), "its lengths and turns are those of the record")
     yield verdict("jaws", _jaws(tool, m), "none" if tool.jaw is None else "closed < open")
+    if not missing:
+        yield verdict("shaft", _shaft(tool, m), "a cylinder of the record's radius and end")
     yield verdict("pads", _pads(tool, m), f"{len(tool.pads)} touch contype {OBJECT_BITS}")
 
 
@@ -102,7 +106,33 @@ def _jaws(tool: Tool, m: mujoco.MjModel) -> Iterator[str]:
         yield f"open {tool.open} is beyond the joint's range {m.jnt_range[ids[0]].tolist()}"
 
 
+def _shaft(tool: Tool, m: mujoco.MjModel) -> Iterator[str]:
+    """Yields a fault if round geoms along z have other sizes than the record, or pads end apart."""
+    data = mujoco.MjData(m)
+    mujoco.mj_forward(m, data)
+    base, tip = data.site(tool.base), data.site(tool.tcp)
+    found = []
+    for i in np.flatnonzero(np.isin(m.geom_type, ROUND)):
+        z = base.xmat.reshape(3, 3)[:, 2]
+        if abs(z @ data.geom_xmat[i].reshape(3, 3)[:, 2]) > 1.0 - NEAR_TURN:
+            end = (base.xpos - data.geom_xpos[i]) @ z - m.geom_size[i, 1]
+            found.append((float(m.geom_size[i, 0]), float(end)))
+    expected = tool.shaft_radius, tool.shaft_end
+    if found and np.abs(np.array(found) - expected).max(-1).min() > APART:
+        texts = [f"{1e3 * radius:.1f} and {1e3 * end:.1f} mm" for radius, end in found]
+        yield f"shaft_radius and shaft_end differ from the geoms' {', '.join(texts)}"
+    z = tip.xmat.reshape(3, 3)[:, 2]
+    for pad in tool.pads:
+        centre, half = np.split(m.geom_aabb[m.geom(pad).id], 2)
+        R = data.geom(pad).xmat.reshape(3, 3)
+        end = float((data.geom(pad).xpos + R @ centre - tip.xpos) @ z + np.abs(z @ R) @ half)
+        if abs(end - tool.pad_end) > APART:
+            yield f"pad_end: {pad} ends {1e3 * end:.1f} mm past the tip"
+
+
 def _pads(tool: Tool, m: mujoco.MjModel) -> Iterator[str]:
+    if tool.jaw is not None and len(set(tool.pads)) < 2:
+        yield f"jaws grasp with two pads, got {', '.join(tool.pads) or 'none'}"
     for pad in tool.pads:
         fault, ids = attempt("", lambda pad=pad: mjcf_parts.ids("MJCF", m, "geom", [pad]))
         if not fault and not m.geom_conaffinity[ids[0]] & OBJECT_BITS:
