@@ -21,7 +21,7 @@ UNTIL_S = 24.0
 def main(file: Path) -> None:
     """Writes the figure: a panel per policy, a line per disturbance, the clock dashed."""
     with style.use():
-        figure = style.figure(9.6, 6.4)
+        figure = style.figure(9.6, 7.8)
         for axis, policy in zip(figure.subplots(2, 2).ravel(), POLICIES, strict=True):
             draw(axis, files.read_json(_timing.RESULTS / f"monitor_{policy}_gpu.json"))
         data = style.save(figure, "png")
@@ -42,7 +42,7 @@ def draw(axis: Any, found: dict[str, Any]) -> None:
     axis.axvline(clock_s, color="black", lw=1.0, ls="--", label=f"clock alone, {clock_s:.1f} s")
     axis.set(xlim=(0, UNTIL_S), ylim=(0, 1.02), title=found["policy"])
     axis.set(xlabel="time of the first alarm (s)", ylabel="failures announced")
-    axis.legend(fontsize=6, loc="lower right", frameon=True, framealpha=0.9)
+    axis.legend(fontsize=6.5, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)
 
 
 if __name__ == "__main__":

@@ -45,7 +45,7 @@ def success(runs: Sequence[results.Run]) -> Table:
     for run, (seen, unseen) in scores:
         cells = [formats.rate(score) if score else "–" for score in (seen, unseen)]
         for part, score in enumerate((seen, unseen)):
-            if len(scores) > 1 and score and score.rate == best[part]:
+            if len(scores) > 1 and score and score.rate == best[part] > 0:
                 cells[part] = f"**{cells[part]}**"
         cells.append(formats.points(stats.gap(seen, unseen)) if seen and unseen else "–")
         table.append([run.group, run.label, *cells])

@@ -41,7 +41,7 @@ def choose(source: Source) -> str:
     found = fitting(source)
     if len(found) != 1:
         got = f"{', '.join(found) or 'none'} that fits its columns"
-        hint = "starjax inspect shows its columns"
+        hint = "starjax inspect shows its columns, examples/10_data.py has a mapping"
         raise errors.UsageError("--map", f"a file, or one of {', '.join(names())}", got, hint)
     return found[0]
 
