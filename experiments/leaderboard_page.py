@@ -1,6 +1,5 @@
 """Tables of the trocar benchmark's page: our rows, and figures of other papers."""
 
-import itertools
 import json
 import tomllib
 from pathlib import Path
@@ -20,12 +19,7 @@ def ours() -> str:
     files = [file for file in sorted(HERE.rglob("*.json")) if FINETUNED not in file.parts]
     named = [file for file in files if _version(file)]
     rows = leaderboard_tables.current(leaderboard.read(named)[0])
-    drawn = [[SERVED.get(cell, cell) for cell in line] for line in leaderboard_tables.table(rows)]
-    filled = [
-        any(cell != leaderboard_tables.NONE for cell in column[1:])
-        for column in zip(*drawn, strict=True)
-    ]
-    table = [list(itertools.compress(line, filled)) for line in drawn]
+    table = [[SERVED.get(cell, cell) for cell in line] for line in leaderboard_tables.table(rows)]
     numbered = enumerate(leaderboard_tables.commands(rows), 1)
     commands = "\n".join(f"{number}. `{command}`" for number, command in numbered)
     return f"{formats.render(table, names=3)}\n\n{commands}"

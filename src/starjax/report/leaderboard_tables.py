@@ -1,5 +1,6 @@
 """Rows of the trocar benchmark as Markdown, plain text and JSON values."""
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -31,7 +32,7 @@ def reason(rows: Sequence[Row]) -> str:
 
 
 def table(rows: Sequence[Row]) -> formats.Table:
-    """Makes a line per row, with the number of its commands in `commands`."""
+    """Makes a line per row, with the number of its commands in `commands`; no empty columns."""
     header = ["Task", "Method", "Policy", "Seen (%)", "Unseen (%)", "Other trocars (%)"]
     header += ["RCM p99 (mm)", "Stressed (%)", "Commit", "Command"]
     lines = [header]
@@ -40,7 +41,8 @@ def table(rows: Sequence[Row]) -> formats.Table:
         scores = map(_rate, (row.seen, row.unseen, row.others))
         names = _task(row), row.method, _policy(row)
         lines.append([*names, *scores, rcm, _rate(row.stressed), row.commit or NONE, str(number)])
-    return lines
+    filled = [any(cell != NONE for cell in cells[1:]) for cells in zip(*lines, strict=True)]
+    return [list(itertools.compress(line, filled)) for line in lines]
 
 
 def commands(rows: Sequence[Row]) -> list[str]:
