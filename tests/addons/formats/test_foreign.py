@@ -387,7 +387,7 @@ def _mirrored(arrays):
 
 
 BAD = {
-    "nan": (_nan, {}, "p0", "step 7"),
+    "nan": (_nan, {}, "column p0", "step 7"),
     "mm": (lambda a: a | {"p0": 1e3 * a["p0"]}, {}, "position", "30"),
     "length": (_quaternions, {"rotation_as": "quat_xyzw"}, "rotation", "0.5"),
     "numbers": (None, {"rotation_as": "quat_xyzw"}, "R0", "9"),

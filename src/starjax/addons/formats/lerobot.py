@@ -154,7 +154,7 @@ def _column(feature: dict[str, Any]) -> Column | None:
 
 
 def _places_v3(root: Path, info: dict[str, Any], cameras: list[str]) -> Iterator[_Place]:
-    paths = per_file.listed(root / "meta/episodes", "*/*.parquet")
+    paths = per_file.listed(root, "meta/episodes/*/*.parquet")
     base.require(bool(paths), "meta/episodes/*/*.parquet", "none")
     for path in paths:
         table = parquet.read_table(base.require_inside(root, path))
