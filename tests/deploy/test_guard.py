@@ -114,6 +114,30 @@ def test_an_arm_may_be_late_by_some_commands():
     assert names(SOUND, []) == []
 
 
+def test_a_still_arm_is_in_doubt_though_every_plan_begins_at_its_tip():
+    count, no_plan = guard.WATCHED, guard.FOLLOWED
+    sent = [aside(TIP, 0.0002 * (i % 8)) for i in range(count)]
+
+    def found(tips, commands=sent, **bounds):
+        tolerances = guard.Tolerances(**bounds)
+        return [x.name for x in guard.check(SOUND, commands, TROCAR, NOW, tolerances, tips)]
+
+    still, slow = [TIP.p] * count, [at(TIP.p, 0.0002 * (i % 2)) for i in range(count)]
+    assert found(still) == ["stall"] and found(slow) == []
+    assert found(still[1:], sent[1:]) == [] and found(still, [TIP] * count) == []
+    late = [TIP] * (count - no_plan) + sent[-no_plan:]  # the arm has not seen the last ones
+    assert found(still, late) == []
+    assert found(still, max_following=0.01) == [] == found(still, max_following=np.inf)
+    # Of two arms, one moves.
+    both = [Pose(np.stack([DOWN] * 2), np.stack([x.p, at(x.p, 0.1)])) for x in sent]
+    place = Pose(both[0].R, both[0].p)
+    halves = [np.stack([x.p, at(TIP.p, 0.1)]) for x in sent]
+    (doubt,) = guard.check(
+        guard.Snapshot(place), both, np.stack([TROCAR] * 2), NOW, guard.TOLERANCES, halves
+    )
+    assert doubt.name == "stall" and doubt.kind == "arm"
+
+
 def test_of_several_arms_the_worst_counts():
     two = Pose(np.stack([DOWN, DOWN]), np.stack([TIP.p, at(TIP.p, 0.1)]))
     trocars = np.stack([TROCAR, at(TROCAR, 0.104)])

@@ -49,6 +49,15 @@ def test_an_arm_that_does_not_follow_gets_no_more(policy):
     assert away < deploy.Tolerances().max_following + 4 * deploy.Limits().per_step[0]
 
 
+def test_an_arm_that_stays_where_plans_begin_gets_no_more(policy):
+    robot, wide = Robot(stuck=True), deploy.Tolerances(max_following=0.02)
+    slow = deploy.Limits(speed=0.02)
+    report = deploy.drive(
+        robot, policy, served.PORT, 2.0, key=jax.random.key(0), tolerances=wide, limits=slow
+    )
+    assert report.silent > 20 and report.fault.startswith("stall"), report
+
+
 def test_a_trocar_beside_the_shaft_is_refused_before_anything_moves(policy):
     robot, where = Robot(), rcm.trocar_position(served.PORT, policy.p_world_ref)
     beside = np.asarray(where) + np.float32([0.005, 0.0, 0.0])

@@ -117,7 +117,8 @@ class Client:
         self._next_key()  # compiles it
         self._moments: collections.deque[RobotObservation] = collections.deque(maxlen=spec.moments)
         self._tolerances, self._clock, self.doubts = tolerances, clock, []
-        self._sent: collections.deque[Pose] = collections.deque(maxlen=guard.FOLLOWED)
+        self._sent: collections.deque[Pose] = collections.deque(maxlen=guard.WATCHED)
+        self._tips: collections.deque[Any] = collections.deque(maxlen=guard.WATCHED)
         self._is_silent = False
 
     @property
@@ -164,7 +165,7 @@ class Client:
             executor.on_request()
             self._receive()
         command = executor.step()
-        self._sent.append(command.pose)
+        self._record(moment, command.pose)
         return command
 
     def stop(self, fault: str) -> None:
@@ -238,12 +239,17 @@ class Client:
         if arm := [doubt for doubt in self.doubts if doubt.kind == "arm"]:
             raise UsageError("observation", "an arm without doubt", str(arm[0]))
         first = self._executor.begin(moment.pose, moment.gripper)
-        self._sent.append(first.pose)
+        self._record(moment, first.pose)
         self._moments.extend([_bare(moment)] * self.input_spec.moments)
 
     def _forget(self) -> None:
         self._executor.forget()
         self._sent.clear()
+        self._tips.clear()
+
+    def _record(self, moment: RobotObservation, sent: Pose) -> None:
+        self._sent.append(sent)
+        self._tips.append(moment.pose.p)
 
     def _doubts(self, moment: RobotObservation) -> list[guard.Doubt]:
         is_straight = self.input_spec.held_wrist is None
@@ -255,7 +261,7 @@ class Client:
             moment.p_world_trocar,
         )
         now, where = self._clock(), self.p_world_trocar
-        return guard.check(snapshot, self._sent, where, now, self._tolerances)
+        return guard.check(snapshot, self._sent, where, now, self._tolerances, self._tips)
 
     def _receive(self) -> None:
         reply = self._connection.poll()

@@ -23,6 +23,8 @@ MAX_FUTURE_S = 0.02  # s, by which stamps may be ahead of the clock
 MAX_MISFIT = 0.002  # m, between a measured tip and that of the measured joints
 MAX_SKEW = 0.05  # deviation of R'R from the identity, far above rounding and calibration errors
 FOLLOWED = 3  # last commands, one of which the arm must be near: 0.1 s of latency
+WATCHED = 30  # last commands, of 1 s, some of whose motion the arm must make
+MIN_FOLLOWED = 0.1  # share of that motion, which is at least `max_following` / 4
 STALE = ("stale pose", "stale image")
 
 
@@ -95,15 +97,17 @@ def check(
     p_world_trocar: ArrayLike,
     now: float,
     tolerances: Tolerances = TOLERANCES,
+    tips: Sequence[ArrayLike] = (),
 ) -> list[Doubt]:
     """Returns all doubts, none if the robot may be commanded.
 
     Args:
       snapshot: present measurements.
-      commands: poses `[*arms]` of the last `FOLLOWED` commands; none before the first.
+      commands: poses `[*arms]` of the last `WATCHED` commands; none before the first.
       p_world_trocar: `[*arms, 3]` m, the trocar of the plans.
       now: s, by the clock of the stamps.
       tolerances: of the robot.
+      tips: `[*arms, 3]` m, measured before each of `commands`; none: a stall goes unnoticed.
     """
     out: list[Doubt] = []
 
@@ -141,10 +145,18 @@ def check(
         if not moved <= tolerances.max_moved:
             doubt("moved trocar", f"by {_mm(moved)}, at most {_mm(tolerances.max_moved)}")
     if commands:
-        behind = min(_distance(command.p, p) for command in commands)
+        behind = min(_distance(command.p, p) for command in list(commands)[-FOLLOWED:])
         if not behind <= tolerances.max_following:
             text = f"{_mm(behind)} from the last commands, at most {_mm(tolerances.max_following)}"
             doubt("following", text)
+    if tips and len(commands) == len(tips) == WATCHED:
+        # Each plan begins at the measured tip, so the commands of a still arm stay near it.
+        asked = _extent([command.p for command in commands][:-FOLLOWED])
+        made = _extent([*tips, p])
+        is_still = (asked >= tolerances.max_following / 4.0) & (made < MIN_FOLLOWED * asked)
+        if is_still.any():
+            text = f"it moved by {_mm(_most(made[is_still]))} in the last second"
+            doubt("stall", f"{text}, its commands by {_mm(_most(asked[is_still]))}")
     if snapshot.joints is not None and snapshot.limits is not None:
         low, high = np.asarray(snapshot.limits, np.float64).T
         beyond = np.flatnonzero(~((snapshot.joints >= low) & (snapshot.joints <= high)))
@@ -181,6 +193,11 @@ def off_trocar(shaft: Pose, p_world_trocar: ArrayLike) -> np.ndarray:
 
 def _distance(p: ArrayLike, other: ArrayLike) -> float:
     return _most(np.linalg.norm(np.asarray(p, np.float64) - np.asarray(other, np.float64), axis=-1))
+
+
+def _extent(points: Sequence[ArrayLike]) -> np.ndarray:
+    """Returns the diagonals `[*arms]` m of the boxes around points `[*arms, 3]`."""
+    return np.linalg.norm(np.ptp(np.asarray(points, np.float64), axis=0), axis=-1)
 
 
 def _most(values: np.ndarray) -> float:
