@@ -1,9 +1,12 @@
 """Phrases and drawing of needle drive, for reports."""
 
-import mujoco
+from typing import TYPE_CHECKING
 
 from starjax.sim.task import Outline, TaskText
 from starjax.tasks import outlines
+
+if TYPE_CHECKING:  # a robot loads tasks without the simulator
+    import mujoco
 
 TEXT = TaskText(
     title="needle drive",
@@ -19,6 +22,6 @@ TEXT = TaskText(
 )
 
 
-def outline(mj_model: mujoco.MjModel) -> Outline:
+def outline(mj_model: "mujoco.MjModel") -> Outline:
     """Returns the pad's rectangle."""
     return Outline((outlines.rectangle(mj_model, "pad"),), ())
