@@ -1,6 +1,6 @@
 """Checks of an action space: there and back, on the manifold, and total."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -82,7 +82,9 @@ def _poses() -> tuple[Pose, rcm.TrocarFrame]:
     return Pose(rcm.rotation_from_axis_roll(tips - frame.p_world_trocar, rolls), tips), frame
 
 
-def _facts(space: ActionSpace, decode: Any, trocar: rcm.TrocarFrame) -> Iterator[str]:
+def _facts(
+    space: ActionSpace, decode: Callable[..., Any], trocar: rcm.TrocarFrame
+) -> Iterator[str]:
     """Yields facts of the record that decoded actions contradict."""
     action = jax.random.uniform(jax.random.key(2), (COUNT, space.dim), minval=-0.1, maxval=0.1)
     (pose, _), (other, _) = decode(action, trocar), decode(action[::-1], trocar)
