@@ -45,7 +45,10 @@ def test_processes_that_share_do_what_one_does(tmp_path, alone):
     assert same(tmp_path, alone) == 2
 
 
-@pytest.mark.parametrize(("victim", "where"), [(0, "demos/episodes"), (1, "trials")])
+@pytest.mark.parametrize(
+    ("victim", "where"),
+    [(0, "demos/episodes"), pytest.param(1, "trials", marks=pytest.mark.release)],
+)
 def test_a_killed_process_is_a_line_and_the_same_command_goes_on(tmp_path, alone, victim, where):
     started = several.start(SCRIPT, str(tmp_path), "0.2", "-1")
     end = time.monotonic() + 120

@@ -30,7 +30,8 @@ EXPERTS = {  # control steps
 }
 # The script with two arms has no second try, and drops a block now and then.
 DROPS = {"peg_transfer_bimanual": 1}
-LONG = {"needle_regrasp", "suture_throw"}  # needle_drive stands for them in each run
+# needle_drive and needle_handover stand for them in each run.
+LONG = {"needle_regrasp", "suture_throw", "peg_transfer_bimanual"}
 # A pad that lies across the arc touches more of its segments than are kept, the nearest.
 CROWDED = {"needle_pick", "needle_handover", "needle_regrasp"}
 LOOKS = 10  # control steps between two looks at all contacts

@@ -237,7 +237,7 @@ ENDS_ASIDE = STOPS_SHORT._replace(
 )
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_estimate_is_the_derivative_of_success():
     """By differences of the share of success, of the same starts with the same noise."""
     play = explore.make(make_env(), ENDS_ASIDE, None, (), STATIC)
