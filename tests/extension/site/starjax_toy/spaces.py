@@ -1,4 +1,4 @@
-"""An action space of each kind, and a method of each: tips by cylinder coordinates, or as in rcm."""
+"""An action space of each kind, and a method of each: cylinder coordinates, or as in rcm."""
 
 import jax
 import jax.numpy as jnp
@@ -43,9 +43,7 @@ def bent_freely(wrist: rcm.Wrist) -> actions.ActionSpace:
     return rcm.se3_wrist(wrist)._replace(name="toy_wrist_free", for_wrist=bent_freely)
 
 
-FREE = actions.make_space(
-    "toy_free", written, read, is_absolute=True, is_free=True, xy=2, z=1, R=6
-)
+FREE = actions.make_space("toy_free", written, read, is_absolute=True, is_free=True, xy=2, z=1, R=6)
 RELATIVE = actions.make_space("toy_relative", below, on_shaft, xy=2, z=1, R=6)
 ABSOLUTE = rcm.ACTION_SPACES["rcm4"]._replace(name="toy_absolute")
 WRIST, WRIST_RELATIVE, WRIST_FREE = (

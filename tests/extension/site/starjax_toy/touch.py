@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from starjax import rcm
-from starjax.sim.task import Field, Outline, Slot, Task, TaskStatus, TaskText
 from starjax.core.types import Agent, Command
+from starjax.sim.task import Field, Outline, Slot, Task, TaskStatus, TaskText
 
 MARKS = 4
 CLOSE = 0.003  # m
