@@ -1,7 +1,4 @@
-"""Command lines for frozen dataclasses: tyro parses and prints the help, mistakes are one line.
-
-Imports neither jax nor numpy.
-"""
+"""Command lines for frozen dataclasses, by tyro; mistakes are one line. Needs no jax, no numpy."""
 
 import contextlib
 import dataclasses

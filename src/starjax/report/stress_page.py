@@ -7,6 +7,9 @@ from starjax.core import methods
 from starjax.report import formats, page, sections, stats, stress, style
 from starjax.sim import registries
 
+_ERROR = "RCM p99 (mm)"  # name in `stress.StressRow.measured`
+_NAMED = 4  # disturbances in a sentence; more are counted
+
 
 def files(content: Mapping[str, Any], failed: formats.Table) -> dict[str, bytes]:
     """Makes the page, the table and the figure of a stress.json, by name.
@@ -59,9 +62,6 @@ def verdict(content: Mapping[str, Any], done: str) -> str:
     return " ".join([f"Undisturbed, {done} {formats.fraction(plain)}.", *parts])
 
 
-_NAMED = 4  # disturbances in a sentence; more are counted
-
-
 def cards(content: Mapping[str, Any]) -> Iterator[sections.Card]:
     """Yields success without disturbances and at its lowest, and the largest RCM error."""
     found = stress.scores(content)
@@ -79,9 +79,6 @@ def cards(content: Mapping[str, Any]) -> Iterator[sections.Card]:
         more = f"99th percentile under {_named(most)}"
         more += "".join(f"; {score.measured[_ERROR]} mm undisturbed" for score in plain)
         yield sections.Card("Shaft off the trocar, at most", most.measured[_ERROR], " mm", more)
-
-
-_ERROR = "RCM p99 (mm)"  # name in `stress.StressRow.measured`
 
 
 def _facts(content: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -10,6 +10,8 @@ from starjax.report import build, compare, formats, outcomes, page, results, sec
 from starjax.report.sections import Card
 from starjax.report.stats import Rate, rate
 
+_LEVEL = 0.05  # significance level
+
 
 def write(out: Path, content: Mapping[str, Any]) -> Path:
     """Writes the report of a finetune.json and the results next to it; returns its index.html."""
@@ -47,9 +49,6 @@ def _verdict(runs: list[results.Run], test: Paired | None) -> str:
         f"{formats.fraction(before)} before. The difference {chance} "
         f"(p {formats.p_value(test.p)}, paired)."
     )
-
-
-_LEVEL = 0.05  # significance level
 
 
 def _cards(runs: list[results.Run], test: Paired | None) -> Iterator[Card]:
