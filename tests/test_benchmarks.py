@@ -24,7 +24,7 @@ def test_the_training_step_is_timed(monkeypatch, capsys, pytestconfig):
     assert abs(samples * milliseconds / 4e3 - 1) < 0.05  # batches of four
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_peers_of_all_action_spaces_compute_the_same(monkeypatch, capsys, pytestconfig):
     monkeypatch.syspath_prepend(pytestconfig.rootpath / "benchmarks")
     monkeypatch.setattr(sys, "argv", ["bench_rcm.py", "--tiny"])

@@ -10,7 +10,7 @@ from starjax.core.methods import METHODS
 from starjax.data import normalizer
 
 FRAMES = np.arange(240)
-RELATIVE = ["rcm1", "rcm2", "rcm3", "rcm1_fixed_yaw", "rcm2_fixed_yaw"]
+RELATIVE = ["rcm1", "rcm2", "rcm3"]
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,10 @@ import matplotlib.pyplot as plt
 import pytest
 
 SHORT = {"11_ppo": ["--envs", "4", "--iterations", "2"]}
-SLOW = {"04_closed_loop", "06_far_robot", "11_ppo", "12_export"}  # compile, or start a server
+MARKS = {  # some compile, or start a server
+    **{name: [pytest.mark.slow] for name in ("06_far_robot", "12_export")},
+    **{name: [pytest.mark.release] for name in ("04_closed_loop", "11_ppo")},
+}
 PEERS = {"14_serve_lerobot"}  # needs LeRobot: tests/addons/peers/lerobot_closed_loop.py runs it
 
 
@@ -16,9 +19,8 @@ def pytest_generate_tests(metafunc):
         return
     examples = metafunc.config.rootpath.glob("examples/*.py")
     files = sorted(file for file in examples if file.stem not in PEERS)
-    marks = {name: [pytest.mark.slow] for name in SLOW}
     metafunc.parametrize(
-        "file", [pytest.param(file, id=file.stem, marks=marks.get(file.stem, [])) for file in files]
+        "file", [pytest.param(file, id=file.stem, marks=MARKS.get(file.stem, [])) for file in files]
     )
 
 

@@ -47,14 +47,8 @@ def toy(**changed):
     return dataclasses.replace(config.with_learner(fakes.TINY, "toy"), **changed)
 
 
-QUICK = {"dp_ee", "stardiff"}  # one of each kind of policy
-STRAIGHT = [name for name, row in METHODS.items() if not normalizer.has_wrist(row)]
-
-
-@pytest.mark.parametrize(
-    "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in STRAIGHT]
-)
-def test_every_method_works_with_every_learner(name):
+@pytest.mark.parametrize("name", ["dp_ee", "stardiff"])
+def test_each_kind_of_policy_works_with_it(name):
     dataset = fakes.dataset(seed=0, demos=4, length=20, arms=2)
     policy = policies.make(METHODS[name], toy(), fakes.TWO_ARMS, TRAIN)
     stats = normalizer.fit(METHODS[name], fakes.TWO_ARMS, dataset, np.arange(60))

@@ -61,23 +61,13 @@ def usual():
 
 
 @pytest.mark.parametrize(
-    "backend",
-    ["module://nonsense", "nonsense", "svg"],
+    ("backend", "text"),
+    [("module://nonsense", HOSTILE.encode()), ("svg", b"\xff\xfe\x00")],
+    ids=["hostile", "no text"],
 )
-def test_the_users_backend_changes_nothing(usual, backend):
-    assert drawn(MPLBACKEND=backend) == usual
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        pytest.param(HOSTILE.encode(), id="hostile"),
-        pytest.param(b"\xff\xfe\x00", id="no text"),
-    ],
-)
-def test_a_matplotlibrc_changes_nothing(usual, tmp_path, text):
+def test_the_users_backend_and_matplotlibrc_change_nothing(usual, tmp_path, backend, text):
     (tmp_path / "matplotlibrc").write_bytes(text)
-    assert drawn(MATPLOTLIBRC=str(tmp_path)) == usual
+    assert drawn(MPLBACKEND=backend, MATPLOTLIBRC=str(tmp_path)) == usual
 
 
 def test_what_a_program_has_set_changes_nothing_and_stays(usual):

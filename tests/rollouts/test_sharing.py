@@ -66,7 +66,7 @@ def test_a_killed_process_is_a_line_and_the_same_command_goes_on(tmp_path, alone
     assert same(tmp_path, alone) == 2
 
 
-@pytest.mark.parametrize("failing", [0, 1])
+@pytest.mark.parametrize("failing", [0, pytest.param(1, marks=pytest.mark.release)])
 def test_an_error_of_one_process_is_a_line_in_all(tmp_path, failing):
     started = several.start(SCRIPT, str(tmp_path), "0", str(failing))
     said = [error.splitlines() for _, error in several.finish(started)]

@@ -8,9 +8,9 @@ import pytest
 from starjax.sim import mounts, registries
 from starjax.sim.arms.base import opposite
 
-# The first mount of each arm, the others in slow tests: each is a program of its own.
+# The first mount of each arm, the others before a release: each is a program of its own.
 MOUNTS = [
-    pytest.param(arm, tool, workspace, marks=[pytest.mark.slow] if i else [])
+    pytest.param(arm, tool, workspace, marks=[pytest.mark.release] if i else [])
     for arm in registries.arms.names()
     for i, (tool, workspace) in enumerate(registries.arms.get(arm).mounts)
 ]

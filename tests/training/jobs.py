@@ -150,7 +150,7 @@ def processes_main(out: str, asks: int) -> None:
         result = train(
             Path(out) / "run", should_stop=lambda: next(asked) == asks and processes.is_first()
         )
-    except loop.Interrupted as stopped:
+    except KeyboardInterrupt as stopped:
         print(stopped)
         return
     save(Path(out) / f"found-{jax.process_index()}.npz", processes.own(result.state))

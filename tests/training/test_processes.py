@@ -109,7 +109,12 @@ def stop_two(
 
 
 @pytest.mark.parametrize(
-    ("number", "told"), [(signal.SIGINT, (1, 0)), (signal.SIGTERM, (1,)), (signal.SIGTERM, (0,))]
+    ("number", "told"),
+    [
+        (signal.SIGINT, (1, 0)),
+        (signal.SIGTERM, (1,)),
+        pytest.param(signal.SIGTERM, (0,), marks=pytest.mark.release),
+    ],
 )
 def test_a_stop_while_all_train_saves(tmp_path, number, told):
     path = tmp_path / "stardiff/metrics.jsonl"

@@ -188,7 +188,7 @@ def test_a_resumed_training_meets_the_same_images(dataset, monkeypatch, tmp_path
             should_stop=should_stop, draw_images=draw,
         ).state.params["w"]  # fmt: skip
 
-    with pytest.raises(loop.Interrupted):
+    with pytest.raises(KeyboardInterrupt):
         train(tmp_path / "a", should_stop=Stop(4))
     resumed, whole = train(tmp_path / "a"), train(tmp_path / "b")
     assert float(resumed) == float(whole)

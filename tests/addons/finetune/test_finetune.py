@@ -162,7 +162,7 @@ def test_a_fine_tuning_that_is_stopped_has_the_outcome_of_its_rounds(file, monke
 
     def stopped(*args, **kwargs):
         if "Round 2" in kwargs["description"]:
-            raise finetune_stages.loop.Interrupted("stopped")
+            raise KeyboardInterrupt("stopped")
         return run(*args, **kwargs)
 
     monkeypatch.setattr(finetune_stages.loop, "run", stopped)

@@ -17,9 +17,8 @@ parallel_ddim, sampling_unet = (
 )
 
 MODES = {
-    "promotion of types": lambda: jax.numpy_dtype_promotion("strict"),
-    "promotion of ranks": lambda: jax.numpy_rank_promotion("raise"),
-    "double precision": lambda: jax.enable_x64(True),
+    "promotion": lambda: (jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise")),
+    "double precision": lambda: (jax.enable_x64(True),),
 }
 KEY = jax.random.key(0)
 SCHEDULE = schedule.cosine(100)
@@ -104,7 +103,8 @@ def test_every_function_traces_to_the_same_types(mode, on_gpu, monkeypatch):
     monkeypatch.setattr(kernels, "on_gpu", lambda: on_gpu)
     for name, case in CASES.items():
         with contextlib.ExitStack() as stack:
-            stack.enter_context(MODES[mode]())
+            for setting in MODES[mode]():
+                stack.enter_context(setting)
             found = jax.eval_shape(case)
         for leaf in jax.tree.leaves(found):
             assert leaf.dtype in (jnp.float32, jnp.bfloat16), (name, leaf)
