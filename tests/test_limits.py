@@ -15,7 +15,7 @@ RANGES = [
     (start, setting, found)
     for start in (*STARTS, pack.PackArgs("x", "y"))
     for setting in limits.fields(start)
-    if (found := limits.within(setting.hint))
+    if (found := limits.within(setting[2]))
 ]
 
 
@@ -48,7 +48,7 @@ def inside(limit):
 @pytest.mark.parametrize(
     ("start", "setting", "limit"),
     RANGES,
-    ids=[f"{type(start).__module__}.{setting.name}" for start, setting, _ in RANGES],
+    ids=[f"{type(start).__module__}.{setting[0]}" for start, setting, _ in RANGES],
 )
 def test_every_range_names_its_field_its_bounds_and_the_value(start, setting, limit):
     name, path, _ = setting
@@ -71,7 +71,7 @@ def test_every_number_has_a_range():
         if isinstance(operator.attrgetter(path)(start), int | float)
         and not isinstance(operator.attrgetter(path)(start), bool)
     ]
-    ranged = {setting.name for _, setting, _ in RANGES}
+    ranged = {setting[0] for _, setting, _ in RANGES}
     assert len(numbers) > 40 and set(numbers) <= ranged
 
 

@@ -40,7 +40,7 @@ def test_an_expert_that_fails_for_its_tasks_draws_is_a_mistake_of_the_draws(tmp_
         raise success_quota.ExpertFailed("got 0 of 10 at trocar 0")
 
     monkeypatch.setattr(demos, "collect", collect)
-    draws = iter([task_draws.DrawFault("label", "is not finite at [0]")])
+    draws = iter([("label", "is not finite at [0]")])
     monkeypatch.setattr(task_draws, "faults", lambda scene: draws)
     monkeypatch.delitem(registries.tasks.built_in, "reach")  # as of another package
     env = stubs.make_env()

@@ -5,7 +5,7 @@ import weakref
 
 import pytest
 
-from starjax.runtime import garbage
+from starjax.runtime import stored
 
 
 class _Circle:
@@ -14,7 +14,7 @@ class _Circle:
 
 
 def test_nothing_is_collected_meanwhile():
-    with garbage.gc_paused():
+    with stored.gc_paused():
         watched = weakref.ref(_Circle())
         made = [[] for _ in range(50 * gc.get_threshold()[0])]
         assert watched() is not None and made
@@ -24,7 +24,7 @@ def test_nothing_is_collected_meanwhile():
 
 
 def test_a_failure_ends_it():
-    with pytest.raises(ZeroDivisionError), garbage.gc_paused():
+    with pytest.raises(ZeroDivisionError), stored.gc_paused():
         _ = 1 // 0
     assert gc.isenabled()
 
@@ -32,7 +32,7 @@ def test_a_failure_ends_it():
 def test_who_collects_nothing_goes_on_so():
     gc.disable()
     try:
-        with garbage.gc_paused():
+        with stored.gc_paused():
             pass
         assert not gc.isenabled()
     finally:

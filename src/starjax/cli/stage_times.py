@@ -26,7 +26,7 @@ def timed(out: Path, stage: str, resumes: bool = True) -> Iterator[None]:
     if not processes.is_first():  # the first one's time is the run's
         yield
         return
-    start, compiling = time.monotonic(), _CompileSeconds()
+    start, compiled = time.monotonic(), list[float]()
     names = (stage, f"{stage}: compile")
     before = read(out)
     if not resumes and any(name in before for name in names):  # at once: a kill leaves no chance
@@ -35,12 +35,12 @@ def timed(out: Path, stage: str, resumes: bool = True) -> Iterator[None]:
 
     def note() -> None:
         spent = read(out)
-        for name, seconds in zip(names, (time.monotonic() - start, compiling.seconds)):
+        for name, seconds in zip(names, (time.monotonic() - start, sum(compiled))):
             spent[name] = round(spent.get(name, 0.0) + seconds, 2)
         files.write_json(out / "timings.json", spent)
 
     try:
-        with compiling:
+        with _appending(compiled):
             yield
     except BaseException:
         with contextlib.suppress(OSError):  # the interrupted work reports a full disk
@@ -57,18 +57,16 @@ def read(out: Path) -> dict[str, float]:
         return {}
 
 
-class _CompileSeconds:
-    """Sum of the durations of compilations that jax reports inside the context."""
+@contextlib.contextmanager
+def _appending(seconds: list[float]) -> Iterator[None]:
+    """Appends the durations of compilations that jax reports inside the block."""
 
-    def __init__(self) -> None:
-        self.seconds, self._is_job = 0.0, precompile.is_job
+    def add(event: str, duration_secs: float, **kwargs: str | int) -> None:
+        if event in _COMPILE_EVENTS and not precompile.is_job():
+            seconds.append(duration_secs)
 
-    def _add(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
-        if event in _COMPILE_EVENTS and not self._is_job():
-            self.seconds += duration_secs
-
-    def __enter__(self) -> None:
-        jax.monitoring.register_event_duration_secs_listener(self._add)
-
-    def __exit__(self, *_: object) -> None:
-        jax.monitoring.unregister_event_duration_listener(self._add)
+    jax.monitoring.register_event_duration_secs_listener(add)
+    try:
+        yield
+    finally:
+        jax.monitoring.unregister_event_duration_listener(add)

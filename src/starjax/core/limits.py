@@ -57,24 +57,14 @@ Positive = Annotated[float, Range(0.0, math.inf, "()")]
 NotNegative = Annotated[float, Range(0.0, math.inf, "[)")]
 
 
-class Setting(NamedTuple):
-    """A field of a (nested) dataclass.
-
-    Attributes:
-      name: as flags and mistakes call it, e.g. `train.steps`.
-      path: of attributes, e.g. `policy.options.ddim_steps`.
-      hint: its type.
-    """
-
-    name: str
-    path: str
-    hint: Any
-
-
 def fields(
     settings: "DataclassInstance | type[DataclassInstance]", prefix: str = "", path: str = ""
-) -> Iterator[Setting]:
-    """Yields the settings of a dataclass, or of an instance with the types of its parts."""
+) -> Iterator[tuple[str, str, Any]]:
+    """Yields the settings of a dataclass, or of an instance with the types of its parts.
+
+    Each is its name in flags and mistakes, e.g. `train.steps`, its path of attributes, e.g.
+    `policy.options.ddim_steps`, and its type.
+    """
     kind = settings if isinstance(settings, type) else type(settings)
     hints = typing.get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):
@@ -86,7 +76,7 @@ def fields(
             inner = prefix if field.metadata == INLINE else f"{prefix}{field.name}."
             yield from fields(value, inner, f"{where}.")
         else:
-            yield Setting(f"{prefix}{field.name}", where, hint)
+            yield f"{prefix}{field.name}", where, hint
 
 
 def within(hint: Any) -> Range | None:

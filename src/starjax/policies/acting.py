@@ -1,7 +1,6 @@
 """Acting of a policy: a sequence of the generator, then its decoding."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 
@@ -19,14 +18,6 @@ Decode = Callable[
 ]
 
 
-class Acting(NamedTuple):
-    """`sample`, `generate` and `execute` of a `Policy`."""
-
-    sample: Callable[..., Command]
-    generate: Callable[..., jax.Array]
-    execute: Callable[..., Command]
-
-
 def make(
     method: methods.Method,
     policy_config: config.PolicyConfig,
@@ -35,8 +26,8 @@ def make(
     wrist: rcm.Wrist | None,
     decode: Decode,
     extract: Callable[[jax.Array], jax.Array] = lambda vector: vector,
-) -> Acting:
-    """Returns the functions that act.
+) -> tuple[Callable[..., Command], Callable[..., jax.Array], Callable[..., Command]]:
+    """Returns `sample`, `generate` and `execute` of a `Policy`.
 
     Args:
       method, policy_config, sensors: as of the policy.
@@ -81,4 +72,4 @@ def make(
     def _reach(stats):
         return None if stats.action.reach is None else extract(stats.action.reach)
 
-    return Acting(sample, generate, execute)
+    return sample, generate, execute

@@ -40,7 +40,7 @@ def make(
     dim = 4 * arms  # size of what is generated, see `extract`
     networks = generator.make(method, policy_config, sensors, dim)
     observed = generator.sizes(policy_config, sensors, dim).observed
-    rolls = path_network.make(policy_config, arms, observed, history=outputs, outputs=outputs)
+    init, along = path_network.make(policy_config, arms, observed, history=outputs, outputs=outputs)
 
     def lesson(
         key_p: jax.Array, key_roll: jax.Array, action: jax.Array, measured: jax.Array
@@ -60,7 +60,7 @@ def make(
         # 2. turns along the sampled path (Eq. 13), clipped to the demonstrated range
         about = features.trocar_features(trocar.trocar)
         history = by_arm(measured, arms)[..., turns]
-        gamma = rolls.along(params["roll"], p, about, history, condition)
+        gamma = along(params["roll"], p, about, history, condition)
         gamma = jnp.clip(gamma, -1.0, 1.0)  # an MLP extrapolates
         # 3. action vector in the order of the space, decoded on the RCM manifold (Alg. 1)
         action = jnp.concatenate([gamma, p, gripper], axis=-1)
@@ -76,7 +76,7 @@ def make(
     return hierarchy.make(
         *(method, policy_config, sensors, train_config, wrist, networks),
         generated="position",
-        small=hierarchy.SmallNetwork("roll", rolls, lesson),
+        small=hierarchy.SmallNetwork("roll", init, along, lesson),
         decode=decode,
         extract=extract,
     )

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from starjax import rcm
 from starjax.core import config, methods
 from starjax.data import normalizer, windows
-from starjax.policies import acting, features, generator, path_network
+from starjax.policies import acting, features, generator
 from starjax.policies.base import Policy
 from starjax.policies.models import kernels
 from starjax.policies.sequences import Params
@@ -52,12 +52,15 @@ class SmallNetwork(NamedTuple):
 
     Attributes:
       name: of its parameters.
-      network: maps path, trocar and history to N numbers.
+      init: key -> parameters.
+      along: (parameters, path `[B, H, A, n]`, trocar features `[B, A, 7]`, history `[B, O, A, m]`,
+        Condition) -> `[B, H, A, N]` (Eq. 13, and inputs of ablations).
       lesson: (key, key, actions `[B, H, A * (dim + 1)]`, measured) -> Lesson.
     """
 
     name: str
-    network: path_network.PathNetwork
+    init: Callable[[jax.Array], Any]
+    along: Callable[..., jax.Array]
     lesson: Callable[[jax.Array, jax.Array, jax.Array, jax.Array], Lesson]
 
 
@@ -93,7 +96,7 @@ def make(
 
     def init(key: jax.Array) -> Params:
         key_model, key_small = jax.random.split(key)
-        return {**networks.init(key_model), small.name: small.network.init(key_small)}
+        return {**networks.init(key_model), small.name: small.init(key_small)}
 
     def prepare(stats: normalizer.Normalizer, key: jax.Array, batch: windows.Batch) -> Prepared:
         key_inputs, key_model, key_path, key_past = jax.random.split(key, 4)
@@ -116,7 +119,7 @@ def make(
         condition = networks.observe(params, prepared.inputs, prepared.trocar_condition)
         model_loss, metrics = model.loss(params["learner"], condition, prepared.model_inputs)
         path, history, target = prepared.lesson
-        said = small.network.along(params[small.name], path, prepared.trocar, history, condition)
+        said = small.along(params[small.name], path, prepared.trocar, history, condition)
         # The small network reads demonstrated paths: none of its gradient reaches the model, which
         # therefore cannot learn the trocar.
         small_loss = jnp.mean((target - said) ** 2)  # Eq. 14
@@ -128,9 +131,11 @@ def make(
         packed = kernels.packed(params[small.name])
         return {**networks.prepare_for_inference(params), small.name: packed}
 
-    acts = acting.make(method, policy_config, sensors, networks, wrist, decode, extract)
+    sample, generate, execute = acting.make(
+        method, policy_config, sensors, networks, wrist, decode, extract
+    )
     metrics = (*losses, *model.metrics)
     return Policy(
-        *(init, prepare, loss, acts.sample, metrics),
-        *(networks.cast_params, prepare_for_inference, acts.generate, acts.execute),
+        *(init, prepare, loss, sample, metrics),
+        *(networks.cast_params, prepare_for_inference, generate, execute),
     )

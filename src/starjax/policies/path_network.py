@@ -1,7 +1,7 @@
 """The small network of a hierarchy: one for all arms, given each arm's path and trocar."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,19 +12,6 @@ from starjax.policies.models import kernels, roll_net
 from starjax.policies.sequences import Params
 
 
-class PathNetwork(NamedTuple):
-    """Pure functions of one network's parameters.
-
-    Attributes:
-      init: key -> parameters.
-      along: (parameters, path `[B, H, A, n]`, trocar features `[B, A, 7]`, history `[B, O, A, m]`,
-        Condition) -> `[B, H, A, N]` (Eq. 13, and inputs of ablations).
-    """
-
-    init: Callable[[jax.Array], Any]
-    along: Callable[..., jax.Array]
-
-
 def make(
     policy_config: config.PolicyConfig,
     arms: int,
@@ -32,8 +19,8 @@ def make(
     path: int = 3,
     history: int = 1,
     outputs: int = 1,
-) -> PathNetwork:
-    """Builds the network.
+) -> tuple[Callable[[jax.Array], Any], Callable[..., jax.Array]]:
+    """Builds `init` and `along` of a `hierarchy.SmallNetwork`.
 
     Args:
       policy_config: its width and blocks, and the ablations of its inputs.
@@ -80,4 +67,4 @@ def make(
         )
         return found.reshape(batch, arms, horizon, outputs).swapaxes(1, 2)  # [B, H, A, N]
 
-    return PathNetwork(init, along)
+    return init, along

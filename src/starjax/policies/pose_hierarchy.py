@@ -43,7 +43,7 @@ def make(
     dim = arms * (space.dim + 1)
     networks = generator.make(method, policy_config, sensors, dim)
     observed = generator.sizes(policy_config, sensors, dim).observed
-    turns = path_network.make(policy_config, arms, observed, path=space.dim, history=6)
+    init, along = path_network.make(policy_config, arms, observed, path=space.dim, history=6)
 
     def lesson(
         key_turn: jax.Array, key_history: jax.Array, action: jax.Array, measured: jax.Array
@@ -64,7 +64,7 @@ def make(
         # 2. turns about the wire, for this trocar
         about = features.trocar_features(trocar.trocar)
         history = by_arm(measured, arms)[..., rotation]
-        turn = turns.along(params["turn"], path[..., : space.dim], about, history, condition)
+        turn = along(params["turn"], path[..., : space.dim], about, history, condition)
         turn = TURN * jnp.clip(turn[..., 0], -MAX_TURN, MAX_TURN)
         path = path.at[..., rotation].set(turned(path[..., rotation], turn))
         # 3. shaft and wrist through the trocar, in closed form
@@ -73,6 +73,6 @@ def make(
     return hierarchy.make(
         *(method, policy_config, sensors, train_config, wrist, networks),
         generated="pose",
-        small=hierarchy.SmallNetwork("turn", turns, lesson),
+        small=hierarchy.SmallNetwork("turn", init, along, lesson),
         decode=decode,
     )

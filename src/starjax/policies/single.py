@@ -57,15 +57,15 @@ def make(
     def decode(params, stats, x0, measured, condition, trocar):
         return execution.command(method, stats, x0, trocar, wrist)
 
-    acts = acting.make(method, policy_config, sensors, networks, wrist, decode)
+    sample, generate, execute = acting.make(method, policy_config, sensors, networks, wrist, decode)
     return Policy(
         networks.init,
         prepare,
         loss,
-        acts.sample,
+        sample,
         model.metrics,
         networks.cast_params,
         networks.prepare_for_inference,
-        acts.generate,
-        acts.execute,
+        generate,
+        execute,
     )

@@ -1,6 +1,6 @@
 """Digests of functions with all that their closures hold, without tracing them.
 
-Code is known by its name: the digest of a program adds that of the sources of `Content.modules`.
+Code is known by its name: the digest of a program adds that of the sources of its modules.
 """
 
 import dataclasses
@@ -10,7 +10,7 @@ import hashlib
 import sys
 import types
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,32 +26,19 @@ _BY_REPR = (
 _INTERACTIVE = ("__main__", "__mp_main__")
 
 
-class Unknown(TypeError):
-    """An object whose content this module cannot read."""
+def of(*objects: Any) -> tuple[str, set[str]]:
+    """Returns the digest of objects: constants, containers, arrays, functions with closures.
 
-
-class Content(NamedTuple):
-    """The content of objects.
-
-    Attributes:
-      digest: of their values.
-      modules: that define their functions and types.
-    """
-
-    digest: str
-    modules: frozenset[str]
-
-
-def of(*objects: Any) -> Content:
-    """Returns the content of objects: constants, containers, arrays, functions with closures.
+    Returns:
+      the digest of their values, and the modules that define their functions and types.
 
     Raises:
-      Unknown: one holds an object of another kind, or a function of a script or a notebook.
+      TypeError: one holds an object of another kind, or a function of a script or a notebook.
     """
     walk = _Walk()
     for x in objects:
         walk.add(x)
-    return Content(walk.total.hexdigest(), frozenset(walk.modules))
+    return walk.total.hexdigest(), walk.modules
 
 
 class _Walk:
@@ -117,7 +104,7 @@ class _Walk:
             public = {name: part for name, part in vars(x).items() if not name.startswith("_")}
             options = repr(getattr(x, "_jit_info", ""))
             return self._name(type(x)), [(options, x.__wrapped__), *public.items()]
-        raise Unknown(f"{self._name(type(x))}: {x!r:.80}")
+        raise TypeError(f"{self._name(type(x))}: {x!r:.80}")
 
     def _parts(self, kind: str, named: Iterable[tuple[Any, Any]]) -> None:
         self._words(kind)
@@ -139,7 +126,7 @@ class _Walk:
     def _name(self, x: Any) -> str:
         module = getattr(x, "__module__", None) or "builtins"
         if module in _INTERACTIVE:
-            raise Unknown(f"{x!r:.80} of a script or a notebook")
+            raise TypeError(f"{x!r:.80} of a script or a notebook")
         self.modules.add(module)
         return f"{module}:{getattr(x, '__qualname__', x.__name__)}"
 

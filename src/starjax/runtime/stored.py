@@ -8,6 +8,7 @@ is traced in each process. Like jax's cache, the folder is trusted.
 
 import contextlib
 import functools
+import gc
 import hashlib
 import importlib.metadata
 import json
@@ -16,12 +17,12 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 from jax import export
 
-from starjax.runtime import files, fingerprint, garbage, notice, package_files, tree_json, xla
+from starjax.runtime import files, fingerprint, notice, package_files, tree_json, xla
 
 KEPT = 4  # folders of other sources, e.g. of other versions in other environments
 _FREE = (
@@ -32,16 +33,7 @@ _thread = threading.local()
 is_used = True  # tests replace functions in modules, which no key sees
 
 
-class Stored(NamedTuple):
-    """A traced program.
-
-    Attributes:
-      exported: of flat arguments, to flat results.
-      result: structure of the results.
-    """
-
-    exported: export.Exported
-    result: Any
+Stored = tuple[export.Exported, Any]  # of flat arguments to flat results, and their structure
 
 
 def program(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -52,14 +44,31 @@ def program(function: Callable[..., Any]) -> Callable[..., Any]:
 
     def traced(*args: Any) -> Any:
         notice.traced()
-        with garbage.gc_paused():
+        with gc_paused():
             stored = _find(function, args)
             if stored is None:
                 return function(*args)
-            return jax.tree.unflatten(stored.result, stored.exported.call(*jax.tree.leaves(args)))
+            exported, structure = stored
+            return jax.tree.unflatten(structure, exported.call(*jax.tree.leaves(args)))
 
     name = getattr(function, "func", function)
     return functools.wraps(name, updated=())(traced) if hasattr(name, "__name__") else traced
+
+
+@contextlib.contextmanager
+def gc_paused() -> Iterator[None]:
+    """Disables Python's garbage collector inside the block.
+
+    Tracing makes a million objects and throws few of them away. Looking through them again and
+    again takes a seventh of its time.
+    """
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 @contextlib.contextmanager
@@ -103,7 +112,7 @@ def _read(path: Path) -> Stored | None:
         if hashlib.sha256(content).hexdigest().encode() != digest:
             return None
         result, _, exported = content.partition(b"\n")
-        return Stored(export.deserialize(bytearray(exported)), tree_json.decode(json.loads(result)))
+        return export.deserialize(bytearray(exported)), tree_json.decode(json.loads(result))
     except Exception:  # no file, or one of another version
         return None
 
@@ -121,15 +130,14 @@ def _export(function: Callable[..., Any], args: Any, platform: str, path: Path) 
     # jax has another word for its default platform's compilers: "cuda" for "gpu".
     platforms = None if platform == jax.default_backend() else [platform]
     exported = export.export(jax.jit(flat), platforms=platforms)(*shapes)
-    stored = Stored(exported, results[-1])
     # No permission, or no package flatbuffers: the program runs and is not stored.
     with contextlib.suppress(ImportError, OSError, TypeError, ValueError):
-        result = json.dumps(tree_json.encode(stored.result)).encode()
+        result = json.dumps(tree_json.encode(results[-1])).encode()
         content = result + b"\n" + bytes(exported.serialize())
         _evict(path.parent)
         digest = hashlib.sha256(content).hexdigest().encode()
         files.write_bytes(path, digest + b"\n" + content)
-    return stored
+    return exported, results[-1]
 
 
 def _evict(folder: Path) -> None:
@@ -149,9 +157,9 @@ def _key(function: Callable[..., Any], args: Any) -> str:
     names = sorted(set(jax.config.values) - set(_FREE))
     settings = [(name, str(getattr(jax.config, name, jax.config.values[name]))) for name in names]
     with jax.ensure_compile_time_eval():  # reads arrays of closures inside a trace
-        content = fingerprint.of(function, tree, settings)
-    code = package_files.digests(content.modules)
-    return hashlib.sha256(repr((content.digest, code)).encode()).hexdigest()
+        digest, modules = fingerprint.of(function, tree, settings)
+    code = package_files.digests(modules)
+    return hashlib.sha256(repr((digest, code)).encode()).hexdigest()
 
 
 def _avals(leaves: list[Any]) -> list[Any]:

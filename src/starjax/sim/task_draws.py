@@ -1,7 +1,7 @@
 """Draws of a task's reset, looked at on the host: finite, and equal with one key."""
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,20 +14,11 @@ from starjax.sim.scene import Scene
 KEYS = 8  # resets that are looked at
 
 
-class DrawFault(NamedTuple):
-    """A fault of a function of the reset.
+def faults(scene: Scene) -> Iterator[tuple[str, str]]:
+    """Yields the faults of the first of some resets that has any.
 
-    Attributes:
-      function: its name in the task's record.
-      text: the part of its result, and the fault.
+    Each is the name of a function in the task's record, and the part of its result with the fault.
     """
-
-    function: str
-    text: str
-
-
-def faults(scene: Scene) -> Iterator[DrawFault]:
-    """Yields the faults of the first of some resets that has any."""
     for seed in range(KEYS):
         found = list(_of_reset(scene, seed))
         yield from found
@@ -35,26 +26,26 @@ def faults(scene: Scene) -> Iterator[DrawFault]:
             return
 
 
-def _of_reset(scene: Scene, seed: int) -> Iterator[DrawFault]:
+def _of_reset(scene: Scene, seed: int) -> Iterator[tuple[str, str]]:
     """Yields results that differ between two resets with one key, or are not finite."""
     rows = (jax.tree_util.tree_leaves_with_path(_reset(scene, seed)) for _ in range(2))
     for (path, first), (_, second) in zip(*rows, strict=True):
         name, part = path[0].key, jax.tree_util.keystr(path[1:])
         if not np.array_equal(first, second, equal_nan=True):
-            yield DrawFault(name, f"{part} differs between two resets with one key".strip())
+            yield name, f"{part} differs between two resets with one key".strip()
         elif not np.isfinite(np.asarray(first)).all():
             bad = np.flatnonzero(~np.isfinite(np.ravel(first))).tolist()
-            yield DrawFault(name, f"{part} is not finite at {bad}".strip())
+            yield name, f"{part} is not finite at {bad}".strip()
 
 
 def require_finite(scene: Scene) -> None:
     """Raises UsageError for the first fault; it names the function and its file."""
     task = scene.task
-    for fault in faults(scene):
+    for function, fault in faults(scene):
         raise errors.UsageError(
-            user_code.subject(f"task {task.name}", fault.function, getattr(task, fault.function)),
+            user_code.subject(f"task {task.name}", function, getattr(task, function)),
             "finite numbers that the key alone determines",
-            fault.text,
+            fault,
             f"starjax check {task.name}",
         )
 

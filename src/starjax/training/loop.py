@@ -36,10 +36,6 @@ _CALL_SECONDS = 1.0  # target duration of a compiled call, which delays Ctrl-C a
 HoldoutError = Callable[[states.TrainState], dict[str, float]]
 
 
-class Interrupted(KeyboardInterrupt):
-    """Training was stopped after writing a checkpoint; the same command resumes."""
-
-
 class TrainingResult(NamedTuple):
     """A finished training.
 
@@ -89,7 +85,7 @@ def run(
       seed: of everything random.
       cameras: that the policy reads, in this order; empty: the task's first one.
       mesh_devices: all of jax's by default.
-      should_stop: polled about once a second; True saves and raises Interrupted.
+      should_stop: polled about once a second; True saves and raises KeyboardInterrupt.
       description: name of the progress bar.
       step_program: from `training.precompile` with these arguments.
       draw_images: draws those that training draws anew, from the dataset's sources; needed if
@@ -97,7 +93,7 @@ def run(
       start: of a training that continues another; by default that of a new policy.
 
     Raises:
-      Interrupted: after `should_stop`.
+      KeyboardInterrupt: after `should_stop`.
       StorageError: the disk is full.
       UsageError: the directory holds a training of another seed, of other demonstrations, or of
         more steps; or no loss of a whole stretch of the log was finite. That its method and
@@ -197,7 +193,7 @@ def _train(
             if any(stop):
                 if number > saved:
                     _save(directory, to_state(state), train_config)
-                raise Interrupted(
+                raise KeyboardInterrupt(
                     f"stopped after step {number} of {last}; its checkpoint is in {directory}, the "
                     "same command resumes from it"
                 )

@@ -7,23 +7,15 @@ import contextlib
 import importlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from starjax.training import log
 
 PROJECT = "starjax"  # for Weights & Biases
 
 
-class OpenTracker(NamedTuple):
-    """An open tracker.
-
-    Attributes:
-      add: (step, name -> number) adds values.
-      close: writes pending values.
-    """
-
-    add: Callable[[int, dict[str, float]], None]
-    close: Callable[[], None]
+# (step, name -> number) adds values; the other function writes pending ones.
+OpenTracker = tuple[Callable[[int, dict[str, float]], None], Callable[[], None]]
 
 
 def tensorboard(folder: Path, settings: Mapping[str, Any], step: int) -> OpenTracker:
@@ -36,7 +28,7 @@ def tensorboard(folder: Path, settings: Mapping[str, Any], step: int) -> OpenTra
             writer.add_scalar(name, value, step)
         writer.flush()
 
-    return OpenTracker(add, writer.close)
+    return add, writer.close
 
 
 def wandb(folder: Path, settings: Mapping[str, Any], step: int) -> OpenTracker:
@@ -45,7 +37,7 @@ def wandb(folder: Path, settings: Mapping[str, Any], step: int) -> OpenTracker:
     run = importlib.import_module("wandb").init(
         project=PROJECT, name=name, dir=str(folder), config=dict(settings), resume="auto"
     )
-    return OpenTracker(lambda step, values: run.log(values, step=step), run.finish)
+    return lambda step, values: run.log(values, step=step), run.finish
 
 
 # Name, which is also the extra's -> opens it: (folder, settings, first step).
@@ -73,8 +65,8 @@ def following(name: str, folder: Path, settings: Mapping[str, Any]) -> Iterator[
         def follow(step: int, kind: str, values: Mapping[str, Any]) -> None:
             if not writers:
                 writers.append(TRACKERS[name](folder, settings, step))
-                stack.callback(writers[0].close)
-            writers[0].add(step, {f"{kind}/{key}": value for key, value in values.items()})
+                stack.callback(writers[0][1])
+            writers[0][0](step, {f"{kind}/{key}": value for key, value in values.items()})
 
         stack.enter_context(log.followed_by(follow))
         yield
