@@ -66,7 +66,7 @@ FUNCTIONS |= {
 }
 FUNCTIONS |= {f"{s.name}.decode": (s.decode, (drawn(N, s.dim), TROCAR, POINT)) for s in SPACES}
 FUNCTIONS |= {f"{s.name}.encode": (s.encode, (POSE, TROCAR, POINT)) for s in SPACES}
-TYPES = (jnp.bfloat16, jnp.int32)  # of every other function
+TYPES = (jnp.bfloat16, jnp.int32)  # by turns
 
 
 def as_type(given, dtype):

@@ -33,7 +33,8 @@ _thread = threading.local()
 is_used = True  # tests replace functions in modules, which no key sees
 
 
-Stored = tuple[export.Exported, Any]  # of flat arguments to flat results, and their structure
+# A program from flat arguments to flat results, and the structure of these.
+Stored = tuple[export.Exported, Any]
 
 
 def program(function: Callable[..., Any]) -> Callable[..., Any]:
