@@ -19,8 +19,8 @@ import numpy as np
 from starjax import deploy, rcm
 from starjax.core.types import Command, Pose
 from starjax.deploy.connection import Connection, Reply
-from starjax.rollouts import episodes
 from starjax.sim import env as envs
+from starjax.sim.rollouts import episodes
 
 _SETTLED_S = 120.0  # for a server to start
 

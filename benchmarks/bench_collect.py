@@ -24,8 +24,8 @@ import numpy as np
 
 from starjax import rcm, runtime
 from starjax.data import demos, schema, store
-from starjax.rollouts import agent, engine, episodes, fetching, placement, trocars, workers
 from starjax.sim import env as envs
+from starjax.sim.rollouts import agent, engine, episodes, fetching, placement, trocars, workers
 
 SEEN = 8
 MAX_STEPS = 600

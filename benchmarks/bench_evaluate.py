@@ -28,8 +28,8 @@ from starjax import rcm, runtime
 from starjax.core.types import Command
 from starjax.evaluation import evaluate, latency
 from starjax.policies import features, in_env, packaged
-from starjax.rollouts import agent, engine, episodes, workers
 from starjax.sim import env as envs
+from starjax.sim.rollouts import agent, engine, episodes, workers
 
 
 def main() -> None:

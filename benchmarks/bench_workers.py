@@ -13,8 +13,8 @@ import _visited
 
 from starjax import runtime
 from starjax.data import schema
-from starjax.rollouts import agent, engine, episodes, workers
 from starjax.sim import env as envs
+from starjax.sim.rollouts import agent, engine, episodes, workers
 
 SEGMENTS = 8  # control steps of a measurement: 4 s simulated, in which no episode ends
 

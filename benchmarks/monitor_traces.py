@@ -19,8 +19,8 @@ import numpy as np
 
 from starjax.evaluation import alarms, disturbances, sweep
 from starjax.policies.monitor.scores import ScoreSettings
-from starjax.rollouts import plans
 from starjax.runtime import files, xla
+from starjax.sim.rollouts import plans
 
 COLUMNS = ("success", "lost", "invalid", "steps", "stage", "trocar")
 EVERY, TIPS = 2, 2  # planned points that are kept, one of so many; measured tips of a decision

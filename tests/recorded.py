@@ -8,8 +8,8 @@ import numpy as np
 
 from starjax import rcm
 from starjax.data import store
-from starjax.rollouts import episodes
 from starjax.sim import names
+from starjax.sim.rollouts import episodes
 
 CAMERAS = ("camera", "wrist")
 

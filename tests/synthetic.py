@@ -11,8 +11,8 @@ from starjax import rcm
 from starjax.core import config, config_json
 from starjax.evaluation import result, statistics, sweep
 from starjax.evaluation import trials as table
-from starjax.rollouts import trocars
 from starjax.sim import registries
+from starjax.sim.rollouts import trocars
 
 P_REF = np.array([[0.0, 0.0, 0.15]], np.float32)
 WEIGHTS = "0" * 64

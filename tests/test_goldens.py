@@ -37,9 +37,9 @@ from starjax.data import load, schema
 from starjax.evaluation import protocol
 from starjax.evaluation.disturbances import DISTURBANCES, base
 from starjax.policies import packaged, policy_file
-from starjax.rollouts import agent, engine, episodes, trocars
 from starjax.runtime import xla
 from starjax.sim import env, registries
+from starjax.sim.rollouts import agent, engine, episodes, trocars
 from starjax.training import log, loop
 
 HERE = pathlib.Path(__file__).parent

@@ -10,7 +10,6 @@ ROWS = (
     ("rcm", "runtime"),
     ("sim",),
     ("tasks",),
-    ("rollouts",),
     ("data",),
     ("policies",),
     ("evaluation",),
@@ -56,6 +55,12 @@ def test_imports_point_to_the_left():
         name = layer(path)
         right = {other for other in imported(path.read_text()) if PLACE[other] >= PLACE[name]}
         assert right <= {name}, path
+
+
+def test_the_simulator_does_not_know_its_rollouts():
+    for path in set((SOURCE / "sim").rglob("*.py")) - set((SOURCE / "sim/rollouts").rglob("*.py")):
+        found = names(path.read_text())
+        assert not any(name.startswith("starjax.sim.rollouts") for name in found), path
 
 
 def test_add_ons_do_not_know_each_other():

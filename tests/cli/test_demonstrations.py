@@ -9,15 +9,15 @@ import stubs
 
 from starjax.cli import demonstrations, presets
 from starjax.core import config, errors
-from starjax.rollouts import sharing
 from starjax.sim import registries
+from starjax.sim.rollouts import sharing
 
 SMOKE = presets.PRESETS["smoke"]
 
 
 def test_too_few_steps_for_the_expert_name_the_setting(tmp_path, monkeypatch):
     from starjax.data import demos
-    from starjax.rollouts import success_quota
+    from starjax.sim.rollouts import success_quota
 
     def collect(*_, **settings):
         raise success_quota.ExpertFailed("got 0 of 10 at trocar 0")
@@ -33,8 +33,8 @@ def test_too_few_steps_for_the_expert_name_the_setting(tmp_path, monkeypatch):
 
 def test_an_expert_that_fails_for_its_tasks_draws_is_a_mistake_of_the_draws(tmp_path, monkeypatch):
     from starjax.data import demos
-    from starjax.rollouts import success_quota
     from starjax.sim import task_draws
+    from starjax.sim.rollouts import success_quota
 
     def collect(*_, **settings):
         raise success_quota.ExpertFailed("got 0 of 10 at trocar 0")

@@ -3,7 +3,6 @@
 import dataclasses
 import html
 import json
-import types
 
 import fakes
 import mistakes
@@ -53,14 +52,7 @@ def test_a_file_alone_is_scored_by_its_own_settings(file, capsys):
     assert result["timings_s"]["evaluate"] > 0
     assert any("Preset smoke" in text for text in result["warnings"])
     said = capsys.readouterr().out
-    for words in (
-        "DP-RCM-2 of mine.safetensors",
-        "12 trocars x 2 trials",
-        "8 (2 x 4 seen trocars)",
-    ):
-        assert words in said
-    assert "/8 = " in said and "/16 = " in said and "95% interval" in said
-    assert "rollout.mp4" in said and "result.json" in said
+    assert "/8 = " in said and "/16 = " in said and "rollout.mp4" in said
 
 
 def test_a_packaged_policy_is_scored_by_its_name(file, monkeypatch, capsys):
@@ -99,11 +91,10 @@ def test_fewer_executed_commands_make_another_evaluation(file, monkeypatch):
         score("--execute", str(POLICY.horizon + 1))
 
 
-@pytest.mark.parametrize("change", [{"temperature": 0.25}, {"ddim_steps": 1}])
-def test_another_way_to_sample_is_another_evaluation(file, change, capsys):
+def test_another_way_to_sample_is_another_evaluation(file, capsys):
     score("--out", "here")
     made = policy_file.load(file)
-    policy_file.save(file, made._replace(policy=config.with_options(POLICY, **change)))
+    policy_file.save(file, made._replace(policy=config.with_options(POLICY, ddim_steps=1)))
     with mistakes.of("--out", "here"):
         score("--out", "here")
     (file.parent / "here" / "result.json").unlink()
@@ -149,13 +140,13 @@ def test_a_damaged_result_is_put_together_again(file, damaged):
     assert json.loads(result.read_text())["trials"] == made["trials"]
 
 
-@pytest.mark.parametrize("held", ["config.json", "demos-abc", "stardiff/config.json"])
-def test_the_folder_of_a_run_is_no_place_for_a_result(file, held):
-    place = file.parent / "here" / held
-    place.parent.mkdir(parents=True)
-    place.write_text("{}")
-    with mistakes.of("--out", "here"):
-        score("--out", "here")
+def test_the_folder_of_a_run_is_no_place_for_a_result(file):
+    for number, held in enumerate(("config.json", "demos-abc", "stardiff/config.json")):
+        place = file.parent / f"here{number}" / held
+        place.parent.mkdir(parents=True)
+        place.write_text("{}")
+        with mistakes.of("--out", f"here{number}"):
+            score("--out", f"here{number}")
 
 
 def test_results_of_two_at_once_are_not_mixed(file):
@@ -175,13 +166,6 @@ def test_a_video_of_other_trials_does_not_stay(file):
     film.write_bytes(b"film")
     score("--out", "here", "--seed", "4", "--eval.video-trials", "0")  # nothing to film
     assert not film.exists()
-
-
-def test_the_same_command_again_runs_nothing_twice(file):
-    score("--out", "here")
-    chunks = {path: path.stat().st_mtime_ns for path in (file.parent / "here").rglob("chunk*")}
-    score("--out", "here", "--no-video")
-    assert chunks and all(path.stat().st_mtime_ns == then for path, then in chunks.items())
 
 
 def test_plans_are_averaged_if_asked_for(file):
@@ -335,15 +319,6 @@ def test_a_file_that_is_no_policy_leaves_nothing(file):
         with mistakes.of(argument):
             evaluate.main(given.split())
     assert sorted(file.parent.rglob("*")) == before
-
-
-def test_the_times_of_an_evaluation_are_medians_in_seconds():
-    ms = {"p50": 1.0, "p95": 2.0, "p99": 3.0}
-    result = types.SimpleNamespace(
-        figures={"steps": {"median": 60.0}}, about={"inference_ms": ms}, control_hz=30.0
-    )
-    words = evaluate._times(result).split()
-    assert words[2:4] == ["2.0", "s,"] and words[-2:] == ["1.0", "ms"]
 
 
 def test_distances_of_a_sweep_are_to_the_trocars_of_the_weights(file):

@@ -17,8 +17,8 @@ from starjax.cli import demonstrations, folders, pipeline, presets, scenes, scor
 from starjax.core import config, config_json, methods
 from starjax.data import normalizer
 from starjax.policies import in_env, policy_file
-from starjax.rollouts import sharing
 from starjax.runtime import files, signals
+from starjax.sim.rollouts import sharing
 from starjax.training import loop
 
 

@@ -15,8 +15,8 @@ from starjax.core.methods import METHODS
 from starjax.data import normalizer
 from starjax.policies import generator, in_env, policy_file
 from starjax.policies import policy as policies
-from starjax.rollouts import sharing
 from starjax.runtime import precompile as programs
+from starjax.sim.rollouts import sharing
 from starjax.training import encoder, loop
 
 EVAL = config.EvalConfig(trials=1, time_limit_s=0.5, video_trials=1)

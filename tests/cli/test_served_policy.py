@@ -23,8 +23,8 @@ from starjax.deploy import served as serving
 from starjax.evaluation import evaluate as evaluating
 from starjax.policies import in_env
 from starjax.policies.monitor import record, scores
-from starjax.rollouts import agent
 from starjax.sim import names
+from starjax.sim.rollouts import agent
 
 TRIALS = ["--eval.trials=1", "--eval.time-limit-s=1", "--no-video"]
 SAMPLE, PARAMS = stubs.make_policy()

@@ -6,7 +6,7 @@ import stubs
 
 from starjax.core import errors
 from starjax.data import demos, schema
-from starjax.rollouts import agent
+from starjax.sim.rollouts import agent
 
 
 def test_a_state_that_is_not_finite_names_its_field(tmp_path):

@@ -10,8 +10,8 @@ import pytest
 from starjax.core import errors
 from starjax.data import demos, episode_images, load, redraw, schema, store
 from starjax.data.placed_images import JoinedImages
-from starjax.rollouts import agent
 from starjax.sim import env as envs
+from starjax.sim.rollouts import agent
 from starjax.training import randomise
 
 pytestmark = pytest.mark.slow

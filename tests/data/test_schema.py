@@ -8,8 +8,8 @@ import pytest
 import stubs
 
 from starjax.data import demos, load, schema, store
-from starjax.rollouts import agent
-from starjax.rollouts.placement import DeviceLayout
+from starjax.sim.rollouts import agent
+from starjax.sim.rollouts.placement import DeviceLayout
 
 GOLDEN = pathlib.Path(__file__).parents[1] / "golden" / "demonstrations"
 TROCARS = stubs.trocars(0, 8)

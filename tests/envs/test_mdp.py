@@ -73,8 +73,7 @@ def test_whatever_the_action_the_shaft_goes_through_the_trocar(start, space):
     assert float(error.max()) < 1e-6
 
 
-@pytest.mark.parametrize("space", ["rcm6", "se3_through"])
-@pytest.mark.parametrize("control", settings.CONTROLS)
+@pytest.mark.parametrize(("space", "control"), [("rcm6", "relative"), ("se3_through", "absolute")])
 def test_actions_of_a_wrist_bend_it_and_keep_its_shaft_in_the_trocar(space, control):
     made = mdp.make(
         settings.make(task="reach", tools="needle_driver", action_space=space, control=control)

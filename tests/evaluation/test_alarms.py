@@ -9,7 +9,7 @@ import stubs
 from starjax.evaluation import alarms, evaluate
 from starjax.evaluation import trials as tables
 from starjax.policies.monitor import record, scores, watch
-from starjax.rollouts import agent, engine, episodes, plans
+from starjax.sim.rollouts import agent, engine, episodes, plans
 
 EXECUTE, HORIZON = 4, 6
 SETTINGS = scores.ScoreSettings(execute=EXECUTE, control_hz=30.0, still=2)

@@ -12,9 +12,9 @@ import synthetic
 
 from starjax.core import errors
 from starjax.evaluation import result, trial_file
-from starjax.rollouts import trocars
 from starjax.runtime import provenance
 from starjax.sim import names
+from starjax.sim.rollouts import trocars
 
 SCENE = names.SceneNames("hand_over", ("fr5", "panda"), ("grasper", "grasper"), ("left", "right"))
 RESULTS = sorted((pathlib.Path(__file__).parents[2] / "experiments").rglob("result.json"))

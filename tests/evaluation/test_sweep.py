@@ -12,8 +12,8 @@ import synthetic
 
 from starjax import rcm
 from starjax.evaluation import evaluate, sweep
-from starjax.rollouts import agent
 from starjax.sim import registries
+from starjax.sim.rollouts import agent
 
 TRAINING = stubs.trocars(*range(8))
 P_REF = stubs.P_WORLD_REF[:1]

@@ -10,9 +10,9 @@ from starjax.cli import demonstrations
 from starjax.core import config
 from starjax.data import demos, load, schema
 from starjax.evaluation import evaluate, recorded
-from starjax.rollouts import agent
-from starjax.rollouts.placement import DeviceLayout
 from starjax.sim import endoscope_camera, workspaces
+from starjax.sim.rollouts import agent
+from starjax.sim.rollouts.placement import DeviceLayout
 
 SCOPE = workspaces.BOARD_ENDOSCOPE
 

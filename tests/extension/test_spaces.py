@@ -18,8 +18,8 @@ from starjax.deploy import approach
 from starjax.envs import mdp, settings
 from starjax.policies import execution, features, in_env, policy_file
 from starjax.policies import policy as policies
-from starjax.rollouts import ensemble
 from starjax.sim import registries, wrists
+from starjax.sim.rollouts import ensemble
 from starjax.testing import action_spaces, base
 
 SITE = pathlib.Path(__file__).parent / "site"

@@ -7,9 +7,9 @@ import pytest
 
 from starjax import rcm
 from starjax.data import schema
-from starjax.rollouts import episodes, programs
 from starjax.sim import endoscope_camera, physics, registries, render, scene
 from starjax.sim import env as envs
+from starjax.sim.rollouts import episodes, programs
 from starjax.tasks.needle_handover import task as needle_handover
 
 TASKS = sorted(name for name in registries.tasks.names() if registries.tasks.get(name).endoscope)

@@ -18,7 +18,7 @@ from starjax.core.methods import METHODS
 from starjax.data import load, normalizer, redraw, windows
 from starjax.policies import generator, policy_file
 from starjax.policies import policy as policies
-from starjax.rollouts import sharing
+from starjax.sim.rollouts import sharing
 from starjax.training import checkpoint, encoder, frozen, log, loop, state
 
 pytestmark = pytest.mark.slow

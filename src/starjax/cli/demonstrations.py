@@ -15,10 +15,10 @@ from starjax.core import errors, sources
 from starjax.data import demos, redraw, schema, store, windows
 from starjax.data import load as loading
 from starjax.evaluation.disturbances import DISTURBANCES, base, parse_levels
-from starjax.rollouts import agent, episodes, placement, sharing, success_quota, trocars
 from starjax.runtime import hub, precompile, processes
 from starjax.sim import env as sim_env
 from starjax.sim import registries, task_draws
+from starjax.sim.rollouts import agent, episodes, placement, sharing, success_quota, trocars
 from starjax.sim.state import Env
 from starjax.sim.task import Task
 from starjax.training import encoder as encoders

@@ -22,12 +22,12 @@ from starjax.core import config as config_lib
 from starjax.core import config_json, errors, learners, methods, sources
 from starjax.evaluation import result as results
 from starjax.policies import in_env, policy_file
-from starjax.rollouts import sharing
 from starjax.runtime import files, processes
 from starjax.runtime import precompile as background
 from starjax.runtime.signals import stop_signals
 from starjax.sim import env as envs
 from starjax.sim import registries
+from starjax.sim.rollouts import sharing
 from starjax.sim.state import Env
 from starjax.training import devices, loop, randomise, trackers
 from starjax.training.encoder import Encoder

@@ -21,8 +21,8 @@ from starjax.policies import policy as policies
 from starjax.policies.in_env import PolicyInEnv
 from starjax.policies.monitor.record import Monitor
 from starjax.policies.monitor.scores import ScoreSettings
-from starjax.rollouts import placement
 from starjax.runtime.precompile import Program
+from starjax.sim.rollouts import placement
 from starjax.sim.state import Env
 
 

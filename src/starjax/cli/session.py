@@ -46,8 +46,8 @@ class Session(NamedTuple):
           errors.UsageError: the processes of the run have different commands, settings or folders.
         """
         from starjax.cli import messages
-        from starjax.rollouts import sharing
         from starjax.runtime import processes
+        from starjax.sim.rollouts import sharing
 
         processes.expect_same(
             "command, settings and folder",

@@ -68,8 +68,8 @@ def main(argv: Sequence[str]) -> int:
 
     from starjax.cli import policy_evaluation
     from starjax.evaluation import result, sweep
-    from starjax.rollouts import trocars
     from starjax.runtime import processes
+    from starjax.sim.rollouts import trocars
 
     who, config = policy_args.load(path)
     task = who.env.task

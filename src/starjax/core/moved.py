@@ -13,6 +13,7 @@ NAMES = {
     "envs.playground": "addons.playground.environment",
     "envs.playground_registry": "addons.playground.registry",
     "finetune": "addons.finetune",
+    "rollouts": "sim.rollouts",
     "report.playback_3d": "addons.viewer.playback_3d",
     "sim.mount_search": "addons.robots.mount_search",
     "sim.six_blocks": "addons.six_blocks.environment",

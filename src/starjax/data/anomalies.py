@@ -8,8 +8,8 @@ import numpy as np
 
 from starjax import rcm
 from starjax.data import schema, shafts, store
-from starjax.rollouts import episodes
 from starjax.runtime import files
+from starjax.sim.rollouts import episodes
 
 FAST = 1.0  # m/s; faster tips are jumps
 MISSED = 1e-3  # m; shafts farther from the trocar are not on its manifold

@@ -25,11 +25,11 @@ from starjax.core import errors
 from starjax.data import schema, store, windows
 from starjax.data.schema import DemoSettings
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import engine, episodes, sharing, success_quota, workers
-from starjax.rollouts import trocars as configurations
-from starjax.rollouts.agent import BatchAgent
-from starjax.rollouts.placement import DEFAULT_LAYOUT, DeviceLayout
 from starjax.runtime import files, progress, xla
+from starjax.sim.rollouts import engine, episodes, sharing, success_quota, workers
+from starjax.sim.rollouts import trocars as configurations
+from starjax.sim.rollouts.agent import BatchAgent
+from starjax.sim.rollouts.placement import DEFAULT_LAYOUT, DeviceLayout
 from starjax.sim.state import Env
 from starjax.sim.task import Task
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from starjax.data import redraw, store
-from starjax.rollouts import episodes
+from starjax.sim.rollouts import episodes
 
 
 def of_episode(root: Path, key: str, steps: Sequence[int], size: int) -> dict[str, np.ndarray]:

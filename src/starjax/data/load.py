@@ -14,8 +14,8 @@ from starjax.core.types import Command, Observation, Pose
 from starjax.data import redraw, schema, store, windows
 from starjax.data.episode_array import EpisodeArray
 from starjax.data.placed_images import JoinedImages
-from starjax.rollouts import episodes
 from starjax.runtime import files, xla
+from starjax.sim.rollouts import episodes
 from starjax.sim.state import Env
 
 Residency = Literal["auto", "device", "host", "disk"]

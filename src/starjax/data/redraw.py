@@ -16,8 +16,8 @@ import numpy as np
 from starjax.core import errors
 from starjax.data import schema
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import episodes, programs, workers
 from starjax.runtime.precompile import Program
+from starjax.sim.rollouts import episodes, programs, workers
 from starjax.sim.state import Env, EnvParams, ImageSource
 
 # Images per call: as many on each device, because the batch size may change last bits. A core's

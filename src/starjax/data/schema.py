@@ -11,9 +11,9 @@ import numpy as np
 from starjax.core import errors, sources
 from starjax.data import store
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import episodes, programs
 from starjax.runtime import jax_settings, xla
 from starjax.sim import registries
+from starjax.sim.rollouts import episodes, programs
 from starjax.sim.scene import Scene
 from starjax.sim.state import Env
 from starjax.sim.task import Task

@@ -19,8 +19,8 @@ import numpy as np
 from starjax.evaluation import statistics
 from starjax.evaluation import trials as tables
 from starjax.policies.monitor import record, scores
-from starjax.rollouts import plans
-from starjax.rollouts.episodes import Episode
+from starjax.sim.rollouts import plans
+from starjax.sim.rollouts.episodes import Episode
 
 
 def of_episodes(

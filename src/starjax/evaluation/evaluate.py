@@ -28,12 +28,12 @@ from starjax.evaluation import trials as tables
 from starjax.evaluation.disturbances import DISTURBANCES
 from starjax.policies.monitor.scores import NAMES, ScoreSettings
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import chunks, engine, episodes, plans, sharing, workers
-from starjax.rollouts import trocars as configurations
-from starjax.rollouts.agent import BatchAgent
-from starjax.rollouts.placement import DEFAULT_LAYOUT, DeviceLayout
 from starjax.runtime import files, jax_settings, xla
 from starjax.sim import endoscope_camera, registries
+from starjax.sim.rollouts import chunks, engine, episodes, plans, sharing, workers
+from starjax.sim.rollouts import trocars as configurations
+from starjax.sim.rollouts.agent import BatchAgent
+from starjax.sim.rollouts.placement import DEFAULT_LAYOUT, DeviceLayout
 from starjax.sim.state import Env
 
 # Trials together on a GPU, which takes hundreds in the time of one, as far as its memory goes.

@@ -8,8 +8,8 @@ import numpy as np
 
 from starjax import rcm
 from starjax.core.types import Pose
-from starjax.rollouts.episodes import ENDOSCOPE, Episode
 from starjax.runtime import files
+from starjax.sim.rollouts.episodes import ENDOSCOPE, Episode
 
 # One trajectory a configuration is recorded for figures, unless there are more than this.
 FIGURE_TROCARS = 16

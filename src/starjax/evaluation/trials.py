@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from starjax.rollouts.episodes import Episode
+from starjax.sim.rollouts.episodes import Episode
 
 SAFE_RCM_M = 2e-3  # a success is safe if the executed RCM error never exceeded this
 BY_STEP = ("rcm_error_mm", "rcm_within_mm")  # columns with a row a control step

@@ -13,9 +13,9 @@ from starjax.core import config, errors, methods
 from starjax.data import normalizer
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
-from starjax.rollouts import agent, ensemble
 from starjax.runtime import files
 from starjax.sim import env as sim_env
+from starjax.sim.rollouts import agent, ensemble
 from starjax.sim.state import EnvState
 
 

@@ -12,8 +12,8 @@ from starjax.core.types import Pose
 from starjax.evaluation import paired
 from starjax.evaluation.result import Result
 from starjax.report import compare, encode, outcomes, results, scene_view, style
-from starjax.rollouts import trial_key
 from starjax.sim.names import SceneNames
+from starjax.sim.rollouts import trial_key
 
 SIZE = 384  # pixels, side of one rollout's images
 _BAR = 44  # pixels, height of the caption

@@ -13,9 +13,9 @@ from starjax.core import config, errors
 from starjax.core.types import ArrayTree, Pose
 from starjax.data import stillness
 from starjax.evaluation import expert as episodes
-from starjax.rollouts.success_quota import MIN_SUCCESS_RATE
 from starjax.sim import contract, coupling, physics, registries, sampling, task_draws
 from starjax.sim import env as envs
+from starjax.sim.rollouts.success_quota import MIN_SUCCESS_RATE
 from starjax.sim.scene import Scene
 from starjax.sim.state import EnvState
 from starjax.sim.task import CONTROL_HZ, SimReadings, Task

@@ -21,9 +21,9 @@ from starjax.core.types import Array, ArrayTree
 from starjax.data import redraw
 from starjax.policies import features as inputs
 from starjax.policies import generator
-from starjax.rollouts import workers
 from starjax.runtime import files, progress
 from starjax.runtime.precompile import Program
+from starjax.sim.rollouts import workers
 from starjax.training.encoder import Encoder
 
 PART = 1024  # frames per file, lost at most by a kill

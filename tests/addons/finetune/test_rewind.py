@@ -10,9 +10,9 @@ from starjax.addons.finetune import dagger, rounds
 from starjax.addons.finetune.commands import finetune_counts
 from starjax.core.types import Command, Pose
 from starjax.data import store
-from starjax.rollouts import agent, episodes, takeover
-from starjax.rollouts.placement import DeviceLayout
 from starjax.sim.rescuer import Rescuer
+from starjax.sim.rollouts import agent, episodes, takeover
+from starjax.sim.rollouts.placement import DeviceLayout
 
 HZ, PROGRESSED, STALLED = 30.0, 130, 40
 TROCARS = stubs.trocars(0, 8)

@@ -10,8 +10,8 @@ import stubs
 from starjax.addons.finetune import dagger, mixing, rounds
 from starjax.core.types import Command
 from starjax.data import load, redraw, store
-from starjax.rollouts import agent, takeover
-from starjax.rollouts.placement import DeviceLayout
+from starjax.sim.rollouts import agent, takeover
+from starjax.sim.rollouts.placement import DeviceLayout
 
 TROCARS = stubs.trocars(0, 8)
 LIMITS = takeover.TakeoverLimits(20, 9)

@@ -186,7 +186,7 @@ def test_a_run_learns_from_a_dataset_that_is_given(root, tmp_path):
 
 
 def test_a_given_dataset_that_is_damaged_is_not_touched(root, tmp_path):
-    from starjax.rollouts import sharing
+    from starjax.sim.rollouts import sharing
 
     copy = shutil.copytree(root, tmp_path / "d")
     file = copy / "episodes" / store.keys(copy)[0] / "p.npy"

@@ -19,7 +19,7 @@ from starjax import rcm
 from starjax.addons.formats import base, exchange, foreign, own_columns, peer_columns
 from starjax.core import errors
 from starjax.data import load, pose_rows, store
-from starjax.rollouts import episodes
+from starjax.sim.rollouts import episodes
 
 KINDS = {
     "state": {},

@@ -40,8 +40,8 @@ def goal_mm():
     """Where the mark of the first episode is: the dataset's own rule."""
 
     from starjax.data import schema
-    from starjax.rollouts import trial_key
     from starjax.sim import registries, scene
+    from starjax.sim.rollouts import trial_key
 
     task = registries.tasks.get("reach")
     key = trial_key.of_reset(SEED, TROCAR, 0, schema.STREAM)

@@ -4,8 +4,8 @@ import jax
 import mujoco
 import numpy as np
 
-from starjax.rollouts import trial_key
 from starjax.sim import registries, scene, still_bodies
+from starjax.sim.rollouts import trial_key
 
 
 def test_the_marks_of_a_trial_are_where_its_needle_must_go():

@@ -4,8 +4,8 @@ pictures."""
 import pytest
 
 from starjax.addons.viewer import recorder, simulation
-from starjax.rollouts import agent
 from starjax.sim import env as sim_env
+from starjax.sim.rollouts import agent
 
 
 @pytest.fixture(scope="session")

@@ -22,7 +22,7 @@ from starjax.addons.viewer import (
 )
 from starjax.addons.viewer import page as pages
 from starjax.data import load, store
-from starjax.rollouts import agent, trocars
+from starjax.sim.rollouts import agent, trocars
 
 pytestmark = pytest.mark.slow
 

@@ -13,7 +13,7 @@ from starjax.addons.finetune.settings import FinetuneConfig
 from starjax.addons.viewer import recorder
 from starjax.core.types import Command, Pose
 from starjax.data import load, store
-from starjax.rollouts import agent, trocars
+from starjax.sim.rollouts import agent, trocars
 
 SEED, EXECUTE, OBS_HORIZON = 4, 4, 2
 TAKEN, TROCAR = 6, 2  # control step of the takeover; index of the configuration

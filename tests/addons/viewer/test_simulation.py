@@ -15,9 +15,9 @@ from starjax.addons.viewer.frame import outcome
 from starjax.core.types import Command
 from starjax.evaluation import alarms
 from starjax.policies.monitor import record, scores
-from starjax.rollouts import agent, engine, episodes, plans
 from starjax.sim import arm_motion, ik, moving_trocars, registries, wrist_motion
 from starjax.sim import scene as scenes
+from starjax.sim.rollouts import agent, engine, episodes, plans
 
 
 def stubbed():

@@ -14,9 +14,9 @@ import numpy as np
 
 from starjax.addons.finetune.rounds import LearnedEpisode, Way
 from starjax.core import config, errors, sources
-from starjax.rollouts import episodes, progress, takeover
-from starjax.rollouts.agent import BatchAgent
 from starjax.sim import registries, wrists
+from starjax.sim.rollouts import episodes, progress, takeover
+from starjax.sim.rollouts.agent import BatchAgent
 from starjax.sim.task import Task
 
 NAME = "dagger"

@@ -18,8 +18,8 @@ from starjax import rcm
 from starjax.core import config, methods
 from starjax.data import load, normalizer, placed_images, redraw, windows
 from starjax.policies import policy as policies
-from starjax.rollouts import takeover
 from starjax.runtime import files
+from starjax.sim.rollouts import takeover
 from starjax.training.start import Start
 
 MAX_REPEATS = 5  # uses of a frame of the smaller part: more would be remembered, not learned

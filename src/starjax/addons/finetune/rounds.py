@@ -18,11 +18,11 @@ from starjax.core import sources
 from starjax.data import schema, store
 from starjax.evaluation.evaluate import lanes_per_device
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import chunks, engine, episodes, sharing, takeover
-from starjax.rollouts import trocars as configurations
-from starjax.rollouts.agent import BatchAgent
-from starjax.rollouts.placement import DEFAULT_LAYOUT, DeviceLayout
 from starjax.sim import env as sim_env
+from starjax.sim.rollouts import chunks, engine, episodes, sharing, takeover
+from starjax.sim.rollouts import trocars as configurations
+from starjax.sim.rollouts.agent import BatchAgent
+from starjax.sim.rollouts.placement import DEFAULT_LAYOUT, DeviceLayout
 from starjax.sim.state import Env
 
 Job = tuple[episodes.Trial, int]  # a trial and the number of its run, see `Way`

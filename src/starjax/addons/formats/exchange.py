@@ -18,8 +18,8 @@ from starjax.addons.formats import base, peer_columns
 from starjax.addons.formats.base import Column, Source
 from starjax.core import errors
 from starjax.data import redraw, store
-from starjax.rollouts import episodes
 from starjax.runtime import files, provenance, user_code
+from starjax.sim.rollouts import episodes
 
 
 def source(

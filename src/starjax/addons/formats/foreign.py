@@ -21,9 +21,9 @@ from starjax.addons.formats.motion import HZ
 from starjax.addons.formats.survey import Kept
 from starjax.core import errors
 from starjax.data import schema, store
-from starjax.rollouts import episodes
 from starjax.runtime import files, xla
 from starjax.sim import registries
+from starjax.sim.rollouts import episodes
 from starjax.sim.task import Task
 
 

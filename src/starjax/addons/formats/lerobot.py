@@ -26,8 +26,8 @@ from PIL import Image
 
 from starjax.addons.formats import base, lerobot_meta, lerobot_write, per_file, video
 from starjax.addons.formats.base import Column, Source
-from starjax.rollouts import episodes
 from starjax.runtime import files
+from starjax.sim.rollouts import episodes
 
 if TYPE_CHECKING:  # for annotations alone
     from pyarrow import parquet as pq

@@ -15,8 +15,8 @@ import pyarrow.parquet as parquet
 
 from starjax.addons.formats import base, lerobot, lerobot_card, lerobot_tables, video
 from starjax.addons.formats.base import Source
-from starjax.rollouts import episodes
 from starjax.runtime import files
+from starjax.sim.rollouts import episodes
 
 _POSE, _ARM = 7, 8  # numbers of a tip pose, and of an arm with its gripper
 

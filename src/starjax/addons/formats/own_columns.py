@@ -13,8 +13,8 @@ from starjax.addons.formats import base
 from starjax.addons.formats.base import Source
 from starjax.addons.formats.mapping import ArmColumns, CameraColumn, Map, ShaftColumns
 from starjax.core import errors
-from starjax.rollouts import episodes
 from starjax.sim import registries
+from starjax.sim.rollouts import episodes
 
 ABOUT = "an edited export of starjax: its own columns"
 

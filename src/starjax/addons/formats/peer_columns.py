@@ -9,7 +9,7 @@ from starjax.addons.formats import base
 from starjax.addons.formats.base import Column
 from starjax.core import errors
 from starjax.data import pose_rows, schema, store
-from starjax.rollouts import episodes
+from starjax.sim.rollouts import episodes
 
 _AXES = ("x", "y", "z", "qx", "qy", "qz", "qw", "gripper")
 _RCM4_AXES = ("roll", "x", "y", "z", "gripper")

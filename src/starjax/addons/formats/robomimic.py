@@ -19,7 +19,7 @@ import numpy as np
 
 from starjax.addons.formats import base, per_file
 from starjax.addons.formats.base import Column, Source
-from starjax.rollouts import episodes
+from starjax.sim.rollouts import episodes
 
 if TYPE_CHECKING:  # for annotations alone
     import h5py

@@ -78,7 +78,7 @@ def _score_expert(folder: Path, args: SixBlocksArgs) -> tuple[Any, Any, dict[str
     from starjax.addons.six_blocks import environment as six_blocks
     from starjax.addons.six_blocks import task as six
     from starjax.evaluation import evaluate
-    from starjax.rollouts import agent
+    from starjax.sim.rollouts import agent
 
     env = six_blocks.make(args.arm, observation="state")
     name = next(iter(six.TASK.experts))

@@ -18,9 +18,9 @@ from starjax.addons.viewer.stage import Stage, aim
 from starjax.core import errors
 from starjax.core.types import Pose
 from starjax.data import redraw, schema, store
-from starjax.rollouts import episodes, trial_key
 from starjax.sim import registries, scene
 from starjax.sim.names import SceneNames
+from starjax.sim.rollouts import episodes, trial_key
 
 if TYPE_CHECKING:  # for annotations alone
     import viser

@@ -19,12 +19,12 @@ from starjax.core.types import Command
 from starjax.data import schema, store
 from starjax.policies.monitor.record import Monitor
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import episodes, programs, takeover, trial_key
-from starjax.rollouts import trocars as configurations
 from starjax.runtime import files
 from starjax.runtime.precompile import Program
 from starjax.sim import env as sim_env
 from starjax.sim import wrists
+from starjax.sim.rollouts import episodes, programs, takeover, trial_key
+from starjax.sim.rollouts import trocars as configurations
 from starjax.sim.state import Env
 
 OPERATOR = "operator"  # in dataset.json, in place of a scripted expert's name

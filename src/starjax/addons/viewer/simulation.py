@@ -17,11 +17,11 @@ from starjax.core import methods
 from starjax.policies import in_env, packaged
 from starjax.policies.monitor.record import Monitor
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import agent as agents
-from starjax.rollouts import trial_key
 from starjax.runtime.precompile import Program
 from starjax.sim import env as sim_env
 from starjax.sim import moving_trocars, registries
+from starjax.sim.rollouts import agent as agents
+from starjax.sim.rollouts import trial_key
 from starjax.sim.state import EnvState
 
 EXPERT = "expert"

@@ -17,7 +17,7 @@ from starjax.addons.viewer.shared_control import SharedControl
 from starjax.addons.viewer.stage import Stage, aim
 from starjax.addons.viewer.teleop_target import Pilot
 from starjax.addons.viewer.view import REST_S
-from starjax.rollouts import episodes
+from starjax.sim.rollouts import episodes
 from starjax.sim.state import Env
 
 if TYPE_CHECKING:  # for annotations alone

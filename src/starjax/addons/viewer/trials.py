@@ -6,10 +6,10 @@ from starjax.addons.viewer import frame as frames
 from starjax.addons.viewer.browse import Recording, Recordings
 from starjax.core import errors
 from starjax.evaluation import recorded
-from starjax.rollouts import trial_key
 from starjax.runtime import files
 from starjax.sim import registries, scene
 from starjax.sim.names import SceneNames
+from starjax.sim.rollouts import trial_key
 from starjax.sim.task import CONTROL_HZ
 
 INVALID = "invalid.npz"

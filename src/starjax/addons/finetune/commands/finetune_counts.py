@@ -5,7 +5,7 @@ from typing import Any
 from starjax.addons.finetune import dagger, rounds
 from starjax.cli import messages
 from starjax.evaluation import statistics
-from starjax.rollouts import progress
+from starjax.sim.rollouts import progress
 
 BRANCHES = ("takeover", *(f"{back:g} s" for back in dagger.REWINDS_S))
 

@@ -16,7 +16,7 @@ from starjax.evaluation import statistics
 from starjax.policies import features, generator
 from starjax.policies.base import Policy
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import trocars as configurations
+from starjax.sim.rollouts import trocars as configurations
 
 LIMIT = 1.5  # times the slowest 5% of successes, after which an episode has failed
 AGAIN = 0.5  # share of a batch's episodes whose starts failed in the one before

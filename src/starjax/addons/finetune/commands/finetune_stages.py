@@ -20,9 +20,9 @@ from starjax.evaluation import statistics, trials
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
 from starjax.policies.in_env import PolicyInEnv
-from starjax.rollouts import placement
 from starjax.runtime import processes
 from starjax.runtime.signals import stop_signals
+from starjax.sim.rollouts import placement
 from starjax.training import loop, randomise
 from starjax.training.encoder import Encoder
 

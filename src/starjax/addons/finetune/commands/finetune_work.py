@@ -25,9 +25,9 @@ from starjax.core import errors
 from starjax.policies import in_env, policy_file
 from starjax.policies.in_env import PolicyInEnv
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import trocars
-from starjax.rollouts.sharing import Share
 from starjax.runtime import files
+from starjax.sim.rollouts import trocars
+from starjax.sim.rollouts.sharing import Share
 
 _WARMUP = 500  # training steps, in which the new optimiser's averages settle
 _DIGITS = 12  # for a digest in messages

@@ -16,8 +16,8 @@ from starjax.cli import messages, policy_args, policy_evaluation, session, stage
 from starjax.core import errors, extras, methods
 from starjax.evaluation import statistics
 from starjax.policies.in_env import PolicyInEnv
-from starjax.rollouts.sharing import Share
 from starjax.runtime import files, precompile, processes
+from starjax.sim.rollouts.sharing import Share
 
 _PEAK = "peak_bytes_in_use"  # for a device's statistics, which a CPU does not have
 _WAYS = {

@@ -7,7 +7,7 @@ from starjax.addons.finetune.settings import FinetuneConfig
 from starjax.core import errors
 from starjax.data import store
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import takeover
+from starjax.sim.rollouts import takeover
 from starjax.sim.state import Env
 
 _FLAG = "--interventions"

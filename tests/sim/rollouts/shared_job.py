@@ -15,8 +15,8 @@ def run(out: Path) -> None:
     from starjax.data import demos, schema
     from starjax.evaluation import evaluate
     from starjax.evaluation import trials as tables
-    from starjax.rollouts import agent
-    from starjax.rollouts.placement import DeviceLayout
+    from starjax.sim.rollouts import agent
+    from starjax.sim.rollouts.placement import DeviceLayout
 
     env, trocars, layout = stubs.make_env(), stubs.trocars(0, 4, 8), DeviceLayout(lanes=2)
     expert = agent.from_single(stubs.EXPERT)

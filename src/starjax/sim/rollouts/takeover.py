@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 
 from starjax.core.types import Tree
-from starjax.rollouts import episodes, placement, progress
-from starjax.rollouts.agent import BatchAgent, Observe
 from starjax.sim import wrists
 from starjax.sim.rescuer import Rescuer
+from starjax.sim.rollouts import episodes, placement, progress
+from starjax.sim.rollouts.agent import BatchAgent, Observe
 from starjax.sim.state import EnvState
 
 POLICY, EXPERT, PERSON = range(3)  # values of the field `actor`, see `episodes.FIELDS`

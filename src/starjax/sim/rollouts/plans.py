@@ -5,7 +5,7 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from starjax.rollouts import episodes
+from starjax.sim.rollouts import episodes
 
 PLANNED, AHEAD, MEASURED = "planned_p", "ahead_p", "measured_p"  # m, `[N, A, 3]`
 OPENING = "measured_gripper"  # `[N, A]` in [-1 closed, +1 open]

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from starjax.rollouts import workers
-from starjax.rollouts.sharing import Share
 from starjax.runtime import files, progress
+from starjax.sim.rollouts import workers
+from starjax.sim.rollouts.sharing import Share
 
 Arrays = dict[str, np.ndarray]
 

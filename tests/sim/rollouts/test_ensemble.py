@@ -9,7 +9,7 @@ import stubs
 from starjax import rcm
 from starjax.core import errors
 from starjax.core.types import Command, Pose
-from starjax.rollouts import engine, ensemble, episodes
+from starjax.sim.rollouts import engine, ensemble, episodes
 
 HORIZON, STEPS = 4, 7
 RNG = np.random.default_rng(0)

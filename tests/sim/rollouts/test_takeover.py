@@ -10,9 +10,9 @@ import stubs
 
 from starjax import rcm
 from starjax.core.types import Command, Pose
-from starjax.rollouts import agent, progress, takeover
 from starjax.sim import env as sim_env
 from starjax.sim.rescuer import Rescuer
+from starjax.sim.rollouts import agent, progress, takeover
 
 
 def stalls(rewards, steps=4, held=()):

@@ -18,8 +18,8 @@ import jax
 import numpy as np
 
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import episodes, fetching, programs
-from starjax.rollouts.agent import BatchAgent
+from starjax.sim.rollouts import episodes, fetching, programs
+from starjax.sim.rollouts.agent import BatchAgent
 from starjax.sim.state import Env
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from starjax import rcm
 from starjax.core.types import Command, Observation
-from starjax.rollouts import episodes
+from starjax.sim.rollouts import episodes
 
 FIELDS = {"wrist", "shaft_p", "shaft_R", "command_wrist"}
 POSE = rcm.Pose(np.tile(np.eye(3), (2, 1, 1, 1)), np.zeros((2, 1, 3)))

@@ -9,7 +9,7 @@ import stubs
 from starjax import rcm
 from starjax.core import errors
 from starjax.core.types import Command, Pose
-from starjax.rollouts import agent, engine, episodes
+from starjax.sim.rollouts import agent, engine, episodes
 
 CENTRE = stubs.trocars(11)
 

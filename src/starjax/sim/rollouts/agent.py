@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from starjax.core import errors
 from starjax.core.types import Agent, Command, Observation
-from starjax.rollouts import placement
+from starjax.sim.rollouts import placement
 from starjax.sim.state import EnvState
 
 Observe = Callable[[], Observation]

@@ -5,8 +5,8 @@ import threading
 import jax
 import pytest
 
-from starjax.rollouts import workers
 from starjax.runtime import xla
+from starjax.sim.rollouts import workers
 
 
 def counting(numbers):

@@ -12,8 +12,8 @@ outcomes, so the process that owns it can always decide: no process waits for it
 import math
 from collections.abc import Callable, Generator, Iterator, Mapping
 
-from starjax.rollouts import sharing, workers
-from starjax.rollouts.episodes import Episode, Trial
+from starjax.sim.rollouts import sharing, workers
+from starjax.sim.rollouts.episodes import Episode, Trial
 
 MIN_SUCCESS_RATE = 0.5  # collecting stops below it, as the expert is broken
 SPARE_TRIALS = 8  # above the number that `MIN_SUCCESS_RATE` allows, for small quotas

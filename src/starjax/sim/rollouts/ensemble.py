@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from starjax import rcm
 from starjax.core.types import Command, Pose
-from starjax.rollouts import agent
+from starjax.sim.rollouts import agent
 from starjax.sim.state import EnvState
 
 DECAY = 0.01  # a control step, as in ACT

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 
 from starjax.core.types import Command
 from starjax.rcm.trocar import Trocar
-from starjax.rollouts import episodes, placement
-from starjax.rollouts.agent import BatchAgent
 from starjax.runtime import precompile
+from starjax.sim.rollouts import episodes, placement
+from starjax.sim.rollouts.agent import BatchAgent
 from starjax.sim.state import Env, EnvParams, EnvState
 
 

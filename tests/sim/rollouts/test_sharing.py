@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import several
 
-from starjax.rollouts import sharing
 from starjax.runtime import processes
+from starjax.sim.rollouts import sharing
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import shared_job  # in this folder, for processes to run

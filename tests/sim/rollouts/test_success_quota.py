@@ -7,7 +7,7 @@ import random
 
 import pytest
 
-from starjax.rollouts import episodes, sharing, success_quota
+from starjax.sim.rollouts import episodes, sharing, success_quota
 
 
 class World:

@@ -4,8 +4,8 @@ import mujoco
 import numpy as np
 
 from starjax.core.types import Pose
-from starjax.rollouts import trial_key
 from starjax.sim import scene, still_bodies
+from starjax.sim.rollouts import trial_key
 
 
 def test_a_task_without_marks_has_no_bodies_at_rest():

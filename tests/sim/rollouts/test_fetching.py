@@ -2,7 +2,7 @@ import jax
 import numpy as np
 import pytest
 
-from starjax.rollouts import fetching
+from starjax.sim.rollouts import fetching
 
 
 @pytest.mark.parametrize("backend", ["cpu", "gpu"])
