@@ -65,65 +65,24 @@ def test_a_row_of_a_result_keeps_the_code_and_command_that_made_it(
     assert found["made"]["two"]["command"] == "python benchmarks/bench_x.py --only two"
 
 
-def rate(won, trials=100):
-    return {"successes": won, "trials": trials, "rate": won / trials, "ci95": [0.0, 1.0]}
-
-
-def report(seen, unseen):
-    return {
-        "seen": rate(seen),
-        "unseen": rate(unseen),
-        "rcm_error_mm": {"executed": {"p99": 0.05}},
-    }
-
-
-def test_a_goal_is_met_by_the_best_way_and_missed_by_points(tmp_path, finetunings):
-    found, finetuned = finetunings
-    best = {**found, "by": "self", "best": 1, "after": report(99, 95)}
-    other = {**found, "weights": "f" * 64, "task": "reach"}
-    for name, content in {"a": found, "b": best, "c": other}.items():
-        (tmp_path / f"finetune_{name}.json").write_text(json.dumps(content))
-    rows = finetuned.ways(tmp_path).splitlines()[2:]
-    assert len(rows) == 3 and "99/100" in rows[0] and "–" in rows[1]
-
-
-def test_rollouts_of_a_policy_gradient_are_its_episodes(tmp_path, finetunings):
-    found, finetuned = finetunings
-    rounds = [{}, {"episodes": 1024, "iterations": [{}] * 4}, {"episodes": 64, "iterations": [{}]}]
-    for name, more in {"rl": {"rounds": rounds}, "distill": {"rounds": [{}, {}]}}.items():
-        content = {**found, "by": name, "weights": name, **more}
-        (tmp_path / f"finetune_{name}.json").write_text(json.dumps(content))
-    counts = [row.split("|")[-3].strip() for row in finetuned.ways(tmp_path).splitlines()[2:]]
-    assert counts == ["–", "4,160"]
-
-
 def test_a_fine_tuning_that_continues_another_is_one_with_it(finetunings):
     found, finetuned = finetunings
     import continued
 
-    first = {**found, "best": 1, "after": report(90, 80)}
-    then = {**found, "weights": "d" * 64, "best": 1, "after": report(95, 85)}
+    first = {**found, "best": 1, "after": 80}
+    then = {**found, "weights": "d" * 64, "best": 1, "after": 85}
     (both,) = continued.joined({"a": first, "b": then}, {"a": ["b"], "other": ["c"]})
     assert both["weights"] == first["weights"] and both["before"] == first["before"]
     assert [row["round"] for row in both["rounds"]] == [0, 1, 2]
-    assert both["best"] == 2 and both["after"]["seen"]["successes"] == 95
+    assert both["best"] == 2 and both["after"] == 85
     assert finetuned.learning_seconds(both) == [0.0, 55.0, 110.0]
     (both,) = continued.joined({"a": first, "b": {**then, "best": 0}}, {"a": ["b"]})
-    assert both["best"] == 1 and both["after"]["seen"]["successes"] == 90
+    assert both["best"] == 1 and both["after"] == 80
 
 
 def test_the_time_of_a_round_is_that_of_learning(finetunings):
     found, finetuned = finetunings
     assert finetuned.learning_seconds(found) == [0.0, 5.0 + 20.0 + 30.0]
-
-
-def test_branches_of_all_fine_tunings_are_counted(tmp_path, finetunings):
-    found, finetuned = finetunings
-    begun = {name: found[name] for name in ("command", "rounds", "task", "commit")}
-    for name, content in {"a": found, "b": begun}.items():
-        (tmp_path / f"finetune_{name}.json").write_text(json.dumps(content))
-    row = "| lost 2/3; stalled 1/5 | 3 | 2 | 3 | lost 0-1; stalled 0-2; stalled 1-3 |"
-    assert finetuned.branches(tmp_path).count(row) == 2
 
 
 @pytest.fixture
@@ -132,23 +91,13 @@ def finetunings(monkeypatch, pytestconfig):
     import finetuned
 
     found = {
-        "by": "dagger",
-        "task": "needle_pick",
-        "commit": "c" * 40,
         "weights": "e" * 64,
-        "command": "starjax finetune runs/a --by dagger --out runs/b",
         "rounds": [
             {"round": 0},
-            {
-                "round": 1,
-                "trials": 800,
-                "takeovers": {"lost": rate(2, 3), "stalled": rate(1, 5)},
-                "branches": {"takeover": 3, "1 s": 2},
-                "not_rescued": {"lost": [[0, 1]], "stalled": [[0, 2], [1, 3]]},
-            },
+            {"round": 1},
         ],
         "best": 0,
-        "before": report(80, 70),
+        "before": 70,
         "timings_s": {
             "round 0 validation": 60.0,
             "round 0 validation: compile": 40.0,
@@ -157,6 +106,5 @@ def finetunings(monkeypatch, pytestconfig):
             "round 1 training": 30.0,
             "round 1 validation": 10.0,
         },
-        "hardware": {"backend": "cpu", "cpu": "a CPU", "cores": 2},
     }
     return found, finetuned

@@ -102,13 +102,3 @@ def test_relative_differs_from_absolute_by_more_than_a_constant(actions):
     pose = decode_everywhere(rcm.ACTION_SPACES["rcm1"], actions["rcm1"])
     relative = np.einsum("tnij,nkj->tnik", pose.R, pose.R[0])
     assert np.ptp(relative, axis=0).max() > 1.0
-
-
-@pytest.mark.parametrize("name", INVARIANT)
-def test_any_action_lies_on_the_manifold(name, actions):
-    """Theorem 2 (Eq. 18): for any output of the network, at every trocar."""
-    pose = decode_everywhere(rcm.ACTION_SPACES[name], 3.0 * actions[name])
-    p_world_trocar = np.asarray(rcm.trocar_position(rcm.TROCARS, P_WORLD_REF), np.float64)[:, None]
-    off_axis = np.cross(pose.p - p_world_trocar, pose.R[..., 2].astype(np.float64))
-    assert np.linalg.norm(off_axis, axis=-1).max() <= 1e-6
-    assert np.min(rcm.insertion_depth(pose, p_world_trocar)) > 0

@@ -20,10 +20,8 @@ def test_a_command_runs_the_trials_of_the_protocol(command):
     args = dataclasses.replace(COMMANDS[command], benchmark=True)
     after = benchmark_args.with_trials(args, command, "reach")
     trocars = args.trocars if command == "sweep" else protocol.TROCARS
-    trials = protocol.TrialSet(
-        "reach", after.seed, after.eval.time_limit_s, trocars, after.eval.trials
-    )
-    assert not list(protocol.departures(command, trials))
+    trials = "reach", after.seed, after.eval.time_limit_s, trocars, after.eval.trials
+    assert not list(protocol.departures(command, *trials))
     same = dataclasses.replace(after, benchmark=False)
     assert benchmark_args.with_trials(same, command, "needle_pick") is same
 

@@ -230,14 +230,13 @@ def text_and_flags(command, capsys):
 
 
 @pytest.mark.parametrize("command", cli.COMMANDS)
-@pytest.mark.parametrize("columns", [40, 80])
-def test_help_stays_within_the_terminal_and_breaks_no_word(command, columns, capsys, monkeypatch):
+def test_help_stays_within_the_terminal_and_breaks_no_word(command, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "1000")
     text, _ = text_and_flags(command, capsys)
-    monkeypatch.setenv("COLUMNS", str(columns))
+    monkeypatch.setenv("COLUMNS", "40")
     wrapped, flags = text_and_flags(command, capsys)
     lines = [line for line in wrapped.splitlines()[1:] if not line.startswith(" ")]
-    assert max(map(len, [*lines, *flags])) <= columns
+    assert max(map(len, [*lines, *flags])) <= 40
     assert wrapped.split() == text.split()
 
 
@@ -248,12 +247,6 @@ def test_short_help_has_the_flags_used_most_and_points_to_the_others(command, ca
     with contextlib.suppress(SystemExit):
         cli.dispatch([command, "-h"])
     assert f"starjax {command} --help-all" in capsys.readouterr().out
-
-
-def test_sections_of_help_have_titles_of_their_own(capsys):
-    with contextlib.suppress(SystemExit):
-        cli.dispatch(["stress", "--help"])
-    assert capsys.readouterr().out.count("directory of the result") == 1
 
 
 @pytest.mark.parametrize("command", cli.COMMANDS)
@@ -279,10 +272,6 @@ def test_a_tracker_is_no_setting_of_a_run_and_needs_its_extra(monkeypatch):
     assert asked == [("--track wandb", "wandb")]
     assert run_settings.tracker(["--track", "wandb"]) == "wandb"
     assert run_settings.tracker([]) == "none"
-
-
-def test_a_command_line_without_words_has_no_flag():
-    assert options.typed_value("preset", []) is None
 
 
 @pytest.mark.parametrize(
@@ -332,24 +321,9 @@ def test_other_shells_have_every_command_and_flag_too(shell, capsys):
     assert all(f"'{word}'" in script for word in [*cli.COMMANDS, "--train.steps", "needle_pick"])
 
 
-@pytest.mark.parametrize(
-    ("command", "words"),
-    [
-        ("bench", "[RUN]"),
-        ("evaluate", "[RUN]"),
-        ("pack", "POLICY OUT"),
-        ("report", "RUN [RUN ...]"),
-    ],
-)
-def test_help_names_the_words_before_the_flags(command, words, capsys):
-    assert f" {words} " in f"{helped(command, capsys)[0]} "
-
-
-@pytest.mark.parametrize("columns", ["1", "5", "12"])
-@pytest.mark.parametrize("kind", ["--help", "--help-all"])
-def test_help_ends_in_a_terminal_of_a_few_columns(columns, kind, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", columns)
-    usage, said = helped("inspect", capsys, kind)
+def test_help_ends_in_a_terminal_of_a_few_columns(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "1")
+    usage, said = helped("inspect", capsys)
     assert usage.startswith("usage: starjax inspect") and said
 
 

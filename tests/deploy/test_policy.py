@@ -47,8 +47,8 @@ def registered():
 
 
 def mostly(kind, other):
-    """One kind of observation; the other in slow tests."""
-    kinds = [kind, pytest.param(other, marks=pytest.mark.slow)]
+    """One kind of observation; the other before a release."""
+    kinds = [kind, pytest.param(other, marks=pytest.mark.release)]
     return pytest.mark.parametrize("made", kinds, indirect=True)
 
 
@@ -103,6 +103,7 @@ def of_one_arm(observation):
 
 
 @pytest.mark.slow
+@MOSTLY_IMAGES
 def test_it_decides_as_the_policy_of_an_evaluation_does(made):
     path, trained, policy = made
     deployed, observation = load(path), observed(trained.policy)
@@ -520,7 +521,7 @@ def test_a_mistake_of_several_arms_or_cameras_is_named(two_arms):
         assert caught.value.argument == argument
 
 
-@pytest.mark.parametrize("prefix", ["", pytest.param("one_", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("prefix", ["", pytest.param("one_", marks=pytest.mark.release)])
 def test_the_packaged_policy_commands_what_it_did(prefix, monkeypatch):
     tasks = registries.Registry("task", {"peg_transfer": "fakes:TASK"})
     monkeypatch.setattr(registries, "tasks", tasks)

@@ -97,12 +97,12 @@ def test_the_default_levels_of_every_disturbance_have_the_protocols():
 
 
 def test_departures_from_the_protocol_are_named():
-    fits = protocol.TrialSet("reach", 0, 15.0, 12, 100)
-    assert not list(protocol.departures("evaluate", fits))
+    fits = {"task": "reach", "seed": 0, "time_limit_s": 15.0, "trocars": 12, "per_trocar": 100}
+    assert not list(protocol.departures("evaluate", **fits))
     for change in ({"seed": 1}, {"time_limit_s": 60.0}, {"trocars": 8}, {"per_trocar": 49}):
-        assert len(list(protocol.departures("evaluate", fits._replace(**change)))) == 1
-    assert list(protocol.departures("sweep", fits)) == ["12 trocars, not 200"]
-    assert len(list(protocol.departures("stress", fits._replace(task="other", seed=3)))) == 1
+        assert len(list(protocol.departures("evaluate", **{**fits, **change}))) == 1
+    assert list(protocol.departures("sweep", **fits)) == ["12 trocars, not 200"]
+    assert len(list(protocol.departures("stress", **{**fits, "task": "other", "seed": 3}))) == 1
 
 
 if __name__ == "__main__":

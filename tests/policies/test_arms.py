@@ -72,7 +72,7 @@ def test_demonstrated_actions_become_each_arms_commands(dataset, name):
     np.testing.assert_allclose(command.gripper[..., 0], batch.command.gripper[..., 0], atol=1e-6)
 
 
-@pytest.mark.parametrize("name", [pytest.param("dp_rcm1", marks=pytest.mark.slow), "stardiff"])
+@pytest.mark.parametrize("name", [pytest.param("dp_rcm1", marks=pytest.mark.release), "stardiff"])
 def test_every_parameter_learns_and_samples_are_on_each_manifold(dataset, name):
     policy = policies.make(METHODS[name], fakes.TINY, fakes.TWO_ARMS, TRAIN)
     stats = normalizer.fit(METHODS[name], fakes.TWO_ARMS, dataset, FRAMES)

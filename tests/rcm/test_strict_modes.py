@@ -122,7 +122,7 @@ def test_values_are_those_of_jaxs_own_settings(i, name):
     assert_same_program(name, arguments, STRICT, lowered(kind, arguments))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.filterwarnings("error")
 def test_a_program_in_double_precision_has_the_same_values():
     usual, double = {}, {}

@@ -352,7 +352,7 @@ def test_wrong_shapes_are_named():
 
 @pytest.mark.parametrize(
     "compose",
-    [lambda: pile(marks=False), pytest.param(composed, marks=pytest.mark.slow)],
+    [lambda: pile(marks=False), pytest.param(composed, marks=pytest.mark.release)],
     ids=["pile", "composed"],
 )
 def test_a_moving_camera_sees_what_a_fixed_one_sees_from_there(compose):

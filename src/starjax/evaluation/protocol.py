@@ -8,7 +8,7 @@ tests/evaluation/test_protocol.py has the digests that tell.
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 VERSION = 1
 SEED = 0  # seed of all trials
@@ -45,24 +45,6 @@ STRESS = {  # level of each disturbance alone, in its unit
 }
 
 
-class TrialSet(NamedTuple):
-    """Trials of a result, as far as the protocol determines them.
-
-    Attributes:
-      task: its name.
-      seed: of the trials.
-      time_limit_s: of a trial.
-      trocars: number of configurations.
-      per_trocar: number of trials at each.
-    """
-
-    task: str
-    seed: int | None
-    time_limit_s: float
-    trocars: int
-    per_trocar: int
-
-
 _PARTS = {
     "evaluate": (TROCARS, TRIALS),
     "sweep": (SWEEP_TROCARS, 1),
@@ -83,20 +65,22 @@ def settings(command: str, task: str, of: SettingsT) -> SettingsT:
     return dataclasses.replace(of, **values)  # type: ignore
 
 
-def departures(command: str, trials: TrialSet) -> Iterator[str]:
+def departures(
+    command: str, task: str, seed: int | None, time_limit_s: float, trocars: int, per_trocar: int
+) -> Iterator[str]:
     """Yields the differences of a result's trials from the protocol, as phrases.
 
     More trials at each trocar are allowed: the first ones count.
     """
-    if trials.task not in TIME_LIMIT_S:
-        yield f"the benchmark lacks the task {trials.task}"
+    if task not in TIME_LIMIT_S:
+        yield f"the benchmark lacks the task {task}"
         return
-    trocars, per_trocar = _PARTS[command]
-    if trials.trocars != trocars:
-        yield f"{trials.trocars} trocars, not {trocars}"
-    if trials.per_trocar < per_trocar:
-        yield f"{trials.per_trocar} trials per trocar, not {per_trocar}"
-    if trials.seed != SEED:
-        yield f"seed {trials.seed} of the trials, not {SEED}"
-    if trials.time_limit_s != TIME_LIMIT_S[trials.task]:
-        yield f"time limit {trials.time_limit_s:g} s, not {TIME_LIMIT_S[trials.task]:g} s"
+    wanted_trocars, least = _PARTS[command]
+    if trocars != wanted_trocars:
+        yield f"{trocars} trocars, not {wanted_trocars}"
+    if per_trocar < least:
+        yield f"{per_trocar} trials per trocar, not {least}"
+    if seed != SEED:
+        yield f"seed {seed} of the trials, not {SEED}"
+    if time_limit_s != TIME_LIMIT_S[task]:
+        yield f"time limit {time_limit_s:g} s, not {TIME_LIMIT_S[task]:g} s"

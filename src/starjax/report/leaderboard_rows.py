@@ -60,18 +60,8 @@ class Row(NamedTuple):
         return stats.rate(sum(s.successes for s in scores), sum(s.trials for s in scores))
 
 
-class RowOfFile(NamedTuple):
-    """A row from one result.
-
-    Attributes:
-      key: equal for results of one policy.
-      row: its scores.
-      reasons: differences of its trials from the protocol's.
-    """
-
-    key: Any
-    row: Row
-    reasons: list[str]
+# Key, equal for results of one policy; its scores; differences of its trials from the protocol's.
+RowOfFile = tuple[Any, Row, list[str]]
 
 
 class _StressFile(msgspec.Struct, kw_only=True):
@@ -105,21 +95,21 @@ def of_file(path: Path) -> RowOfFile:
 def _evaluation(path: Path) -> RowOfFile:
     scored = result.read(path)
     trials = [trial for trial in scored.trials if trial.trial < protocol.TRIALS]
-    reasons = list(protocol.departures("evaluate", _trials(scored)))
+    reasons = list(protocol.departures("evaluate", *_trials(scored)))
     is_seen = {trial.trocar: trial.seen for trial in trials}
     if not reasons and [*map(is_seen.get, range(protocol.TROCARS))] != _SEEN:
         reasons.append(f"trained at {sum(is_seen.values())} trocars, not the first {protocol.SEEN}")
     seen, unseen = outcomes.rates(trials)
     executed = (scored.figures.get("rcm_error_mm") or {}).get("executed") or {}
     row = _row(scored, path)._replace(seen=seen, unseen=unseen, rcm_p99_mm=executed.get("p99"))
-    return RowOfFile((*_key(scored, path), _is_ensemble(scored)), row, reasons)
+    return (*_key(scored, path), _is_ensemble(scored)), row, reasons
 
 
 def _sweep(path: Path) -> RowOfFile:
     scored = result.read_sweep(path)
     row = _row(scored, path)._replace(others=outcomes.tally(scored.trials))
-    reasons = list(protocol.departures("sweep", _trials(scored)))
-    return RowOfFile((*_key(scored, path), False), row, reasons)
+    reasons = list(protocol.departures("sweep", *_trials(scored)))
+    return (*_key(scored, path), False), row, reasons
 
 
 def _stress(path: Path) -> RowOfFile:
@@ -138,25 +128,21 @@ def _stress(path: Path) -> RowOfFile:
         files=(str(path),),
     )
     key = (scene.task, scene.arms, found.method, found.weights, version, False)
-    trials = protocol.TrialSet(
-        *(scene.task, found.seed, found.time_limit_s),
-        *(protocol.TROCARS, found.trials_at_each_trocar),
-    )
-    return RowOfFile(key, row, list(protocol.departures("stress", trials)))
+    trials = scene.task, found.seed, found.time_limit_s, protocol.TROCARS
+    reasons = protocol.departures("stress", *trials, found.trials_at_each_trocar)
+    return key, row, list(reasons)
 
 
 # Key that only results of one command have -> their reader.
 _READERS = {"by_distance": _sweep, "disturbances": _stress, "per_trocar": _evaluation}
 
 
-def _trials(scored: result.Result) -> protocol.TrialSet:
+def _trials(scored: result.Result) -> tuple[str, int | None, float, int, int]:
     counts: dict[int, int] = {}
     for trial in scored.trials:
         counts[trial.trocar] = counts.get(trial.trocar, 0) + 1
     least = min(counts.values(), default=0)
-    return protocol.TrialSet(
-        scored.scene.task, scored.seed, scored.time_limit_s, len(counts), least
-    )
+    return scored.scene.task, scored.seed, scored.time_limit_s, len(counts), least
 
 
 def _key(scored: result.Result, path: Path) -> tuple[Any, ...]:

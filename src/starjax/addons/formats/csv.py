@@ -9,7 +9,6 @@ import contextlib
 import re
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -23,12 +22,6 @@ SUFFIX = ".csv"
 _EPISODE = ("episode", "episode_index")  # names of a column that numbers the episodes
 _HEAD = 1 << 16  # bytes that show a file's dialect
 _NUMBER = r"^\s*[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?\s*$"
-
-
-class _Dialect(NamedTuple):
-    encoding: str
-    delimiter: str
-    decimal_point: str
 
 
 @contextlib.contextmanager
@@ -90,7 +83,8 @@ def _are_numbers(cells: pa.ChunkedArray) -> np.ndarray | None:
     return is_number if 2 * is_number.sum() > len(is_number) else None
 
 
-def _dialect(path: Path) -> _Dialect:
+def _dialect(path: Path) -> tuple[str, str, str]:
+    """Returns the encoding, the delimiter and the decimal point of a file."""
     with open(path, "rb") as file:
         data = file.read(_HEAD)
     encoding = "utf-8"
@@ -106,7 +100,7 @@ def _dialect(path: Path) -> _Dialect:
     expected = "columns separated by , ; | or tabs in the first line"
     base.require(delimiter in header, expected, repr(header[:40].strip()))
     has_commas = delimiter != "," and re.search(r"\d,\d", body) is not None
-    return _Dialect(encoding, delimiter, "," if has_commas else ".")
+    return encoding, delimiter, "," if has_commas else "."
 
 
 def _is_number(kind: pa.DataType) -> bool:

@@ -41,34 +41,26 @@ def validate(work: Work, number: int, who: PolicyInEnv) -> trials.Table:
 
 
 class Imitation:
-    """Rounds that learn from rollouts like from demonstrations."""
+    """Rounds that learn from rollouts, with limits that the policy sets, like demonstrations."""
 
     def __init__(self, work: Work, steps: np.ndarray):
-        """Loads the demonstrations; `steps` as in `Search`."""
-        self._search, self._lessons = Search(work, steps), Lessons(work)
+        """Decides the limits from the control steps `[n]` of the policy's successes."""
+        if not len(steps):
+            raise errors.UsageError("RUN", "a policy with some success", "none in validation")
+        self._work, env = work, work.base.env
+        self._limits, self._max_steps = dagger.limits(steps, env.control_hz, env.task.stalled_s)
+        self._lessons = Lessons(work)
 
     def round(self, number: int, who: PolicyInEnv, before: Path) -> Round | None:
         """Runs and learns a round, from a policy and its file; returns None without lessons."""
-        counts = self._search.collect(number, who)
+        counts = self._collect(number, who)
         self._lessons.add(number)
         if not self._lessons.are_new:
             messages.indented("nothing to learn from")
             return None
         return self._lessons.train(number, before), counts
 
-
-class Search:
-    """Rollouts of all rounds, with the limits that the policy itself has set."""
-
-    def __init__(self, work: Work, steps: np.ndarray):
-        """Decides the limits from the control steps `[n]` of the policy's successes."""
-        if not len(steps):
-            raise errors.UsageError("RUN", "a policy with some success", "none in validation")
-        self._work = work
-        env = work.base.env
-        self._limits, self._max_steps = dagger.limits(steps, env.control_hz, env.task.stalled_s)
-
-    def collect(self, number: int, who: PolicyInEnv) -> dict[str, Any]:
+    def _collect(self, number: int, who: PolicyInEnv) -> dict[str, Any]:
         """Runs the trials of a round with the policy of the round before; returns their counts."""
         work, root = self._work, self._work.folder(number) / "rollouts"
         print(f"\n[round {number}] rollouts: into {root}", flush=True)
