@@ -64,7 +64,8 @@ def marked(page):
     header = HEADER.match(page.read_text())
     said = dict(line.split(": ", 1) for line in header[1].splitlines()) if header else {}
     package = said.get("needs")
-    marks = [pytest.mark.slow] if said.get("tests") == "slow" else []
+    # Its first program runs in tests/test_alone.py.
+    marks = [pytest.mark.release] if said.get("tests") == "slow" else []
     if package and not importlib.util.find_spec(package):
         marks.append(pytest.mark.skip(reason=f"{package} is not installed"))
     return pytest.param(page, marks=marks)

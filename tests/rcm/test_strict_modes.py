@@ -1,4 +1,4 @@
-"""Every public map works, with the same values, under every strict mode of jax."""
+"""Every public map works, with the same values and derivatives, under every strict mode of jax."""
 
 import functools
 import os
@@ -23,8 +23,9 @@ def drawn(*shape):
 
 
 ROTATION = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-POSE = rcm.Pose(ROTATION, drawn(N, 3))
-TROCAR = rcm.Trocar(np.full(N, 2.0), np.ones(N), np.full(N, 3.0))
+ROTATIONS = np.broadcast_to(ROTATION, (N, 3, 3))
+POSE = rcm.Pose(ROTATIONS, drawn(3))
+TROCAR = rcm.Trocar(np.full((2, N), 2.0), np.ones(N), np.array(3.0))
 POINT = drawn(3)
 WRIST = rcm.Wrist(0.25, 0.5, 1.0, 1.0)
 # Axes in every direction, of which bfloat16 has the entries; their lines meet.
@@ -32,18 +33,18 @@ AXES = np.array(
     [[0.0, 0.5, -1.0], [0.5, 0.25, -1.0], [-0.5, 0.0, -1.0], [0.25, -0.5, -1.0], [1, 1, 1]]
 )
 MOVING = rcm.Pose(ROTATION + AXES[..., None] * np.array([0.0, 0.0, 1.0]), POINT / 32 + AXES / 64)
-# Arguments of each public function; every axis and type that jax may refuse to mix.
+# Arguments of each public function; every number of axes and type that jax may refuse to mix.
 GIVEN = {
     "check_trocar": (TROCAR,),
     "insertion_depth": (POSE, POINT),
-    "pose_at_depth": (ROTATION, drawn(N), POINT),
-    "pose_on_manifold": (drawn(N, 3), drawn(N), 2.0, POINT),
+    "pose_at_depth": (ROTATIONS, drawn(2, N), POINT),
+    "pose_on_manifold": (drawn(N, 3), drawn(2, N), 2.0, POINT),
     "project": (POSE, drawn(2, N, 3)),
     "rcm_error": (POSE, drawn(2, N, 3)),
     "roll_of": (ROTATION,),
     "rot6d_decode": (drawn(N, 6),),
     "rot6d_encode": (ROTATION,),
-    "rotation_align": (drawn(N, 3), POINT),
+    "rotation_align": (drawn(2, N, 3), POINT),
     "rotation_from_axis_roll": (drawn(N, 3), drawn(2, N)),
     "rotation_z": (drawn(N),),
     "trocar_frame": (TROCAR, POINT),
@@ -55,10 +56,10 @@ GIVEN = {
 STRAIGHT = [space for space in rcm.ACTION_SPACES.values() if space.for_wrist is None]
 SPACES = [*STRAIGHT, rcm.rcm6(WRIST)]
 WRISTED = {
-    "angles_through": (POSE, POINT),
-    "shaft_of": (POSE, drawn(2)),
-    "through": (POSE, POINT),
-    "tip_of": (POSE, drawn(2)),
+    "angles_through": (POSE, drawn(2, N, 3)),
+    "shaft_of": (POSE, drawn(2, N, 2)),
+    "through": (POSE, drawn(2, N, 3)),
+    "tip_of": (POSE, drawn(2, N, 2)),
 }
 FUNCTIONS = {name: (getattr(rcm, name), given) for name, given in GIVEN.items()}
 FUNCTIONS |= {
@@ -108,7 +109,7 @@ def lowered(function, arrays):
     return jax.jit(program).lower(*arrays)
 
 
-@pytest.mark.parametrize(("i", "name"), enumerate(FUNCTIONS))
+@pytest.mark.parametrize(("i", "name"), list(enumerate(FUNCTIONS)))
 @pytest.mark.filterwarnings("error")
 def test_values_are_those_of_jaxs_own_settings(i, name):
     """Other types are read as float32, before anything else."""
@@ -120,6 +121,21 @@ def test_values_are_those_of_jaxs_own_settings(i, name):
 
     kind = function if name == "check_trocar" else converted  # it returns its argument
     assert_same_program(name, arguments, STRICT, lowered(kind, arguments))
+
+
+@pytest.mark.parametrize("name", [name for name in FUNCTIONS if name != "check_trocar"])
+def test_derivatives_take_arrays_of_any_number_of_axes(name):
+    function, given = FUNCTIONS[name]
+    arguments = jax.tree.map(np.float32, given)
+
+    def slope(*arrays):
+        floats = (x for x in jax.tree.leaves(function(*arrays)) if x.dtype == jnp.float32)
+        return sum(jnp.sum(x) for x in floats)
+
+    gradient = jax.grad(slope, tuple(range(len(given))))
+    wanted = lowered(gradient, arguments).as_text()
+    with jax.numpy_rank_promotion("raise"):
+        assert lowered(gradient, arguments).as_text() == wanted
 
 
 @pytest.mark.release

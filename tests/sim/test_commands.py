@@ -19,11 +19,12 @@ STEPS = 75
 def follow(reset, step):
     """`poses of the lanes -> states` of 2.5 s under them, `[T, N]`, from above the board."""
 
+    begun = reset(0, NOMINAL)
+    for _ in range(40):
+        begun = step(begun, constant([Pose(DOWN, TIP)] * LANES))
+
     def run(poses):
-        state = reset(0, NOMINAL)
-        for _ in range(40):
-            state = step(state, constant([Pose(DOWN, TIP)] * LANES))
-        states = []
+        state, states = begun, []
         for _ in range(STEPS):
             state = step(state, constant(poses))
             states.append(state)
