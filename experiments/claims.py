@@ -3,7 +3,8 @@
 A page has one study, or several in folders of their own (`studies`). claim.toml has of a page:
 
     title, question, answer  the subject, and at most 40 words of answer
-    picture                  {file, text}, or {of, text} of a picture that `pictures.py` draws
+    picture                  {file, text}, or one that `pictures.py` draws: {of, text} of a table,
+                             {x, at, curves, text} of runs
     film                     an mp4 file
     studies                  folders of its studies, if there are several
     short                    true to leave conditions and commands of the studies to tables.md
@@ -47,9 +48,9 @@ DETAILS = ("gap", "tip", "roll", "seeds", "code", "loose", "rcm_won")  # columns
 GROUPS = {
     "The paper": ("methods", "training_trocars", "main_job", "packaged_policies"),
     "Tasks": ("tasks", "experts", "trocar_benchmark"),
-    "Robustness": ("disturbances", "monitor", "served_robots"),
+    "Robustness": ("disturbances", "monitor"),
     "Wrists and needles": ("wrist", "needle_drive"),
-    "Learning": ("learners", "fine_tuning", "ablations"),
+    "Learning": ("pauses", "learners", "fine_tuning", "ablations"),
 }
 _VALUE = re.compile(r"\{((?:\{T\}|[^{}|])+)\|(\w+)(%?)\}")
 

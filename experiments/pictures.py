@@ -3,8 +3,8 @@
     python experiments/pictures.py            draws those that are missing or stale
     python experiments/pictures.py NAME ...   draws those of some pages
 
-A page's `picture` names a table (`of`), or files of stresses (`levels`, with `labels`). The
-digest of the drawn numbers stands in the picture's file; a test compares it with the results.
+A page's `picture` names a table (`of`), files of stresses (`levels`, with `labels`), or runs
+(`curves`, over the numbers `at` of the axis `x`). The digest of the drawn numbers stands in the picture's file; a test compares it with the results.
 """
 
 import hashlib
@@ -64,9 +64,21 @@ def levels(files: Sequence[str], labels: Sequence[str]) -> Scores:
     return scores
 
 
+def curves(page: claims.Study) -> Scores:
+    """Returns success of runs in one panel: "" -> "LABEL NUMBER" -> rate."""
+    picture, row = page.spec["picture"], {}
+    for label, runs in picture["curves"].items():
+        for x, run in zip(picture["at"], runs, strict=True):
+            result = json.loads((page.folder / page.spec["runs"][run]).read_text())["strict"]["all"]
+            row[f"{label} {x}"] = stats.rate(result["successes"], result["trials"])
+    return {"": row}
+
+
 def scores_of(page: claims.Study) -> Scores:
     """Returns the numbers of a page's picture, none for a picture from elsewhere."""
     picture = page.spec["picture"]
+    if "curves" in picture:
+        return curves(page)
     if "levels" in picture:
         return levels(picture["levels"], picture["labels"])
     if "bar" in picture:
@@ -94,6 +106,10 @@ def draw(page: claims.Study) -> bytes:
     with style.use() as shades:
         if "levels" in picture:
             figure = _panels(scores, picture["labels"])
+        elif "curves" in picture:
+            figure = _panels(scores, list(picture["curves"]), across=1, size=(5.0, 2.6))
+            figure.axes[0].set_xlabel(picture["x"])
+            figure.axes[0].set_ylabel("success")
         else:
             figure = _intervals(scores, shades["muted"])
     image = Image.open(io.BytesIO(style.save(figure, "png"))).convert(
@@ -132,10 +148,18 @@ def _intervals(scores: Scores, muted: str) -> Any:
     return figure
 
 
-def _panels(scores: Scores, labels: Sequence[str], across: int = 5) -> Any:
-    """Draws a panel per disturbance: success against level, a line per policy."""
+def _panels(
+    scores: Scores,
+    labels: Sequence[str],
+    across: int = 5,
+    size: tuple[float, float] = (9.0, 1.45),
+) -> Any:
+    """Draws a panel per row: success against level, a line per label.
+
+    `size` is the figure's width, and the height of a row of panels, in inches.
+    """
     down = -(-len(scores) // across)
-    figure = style.figure(9.0, 0.5 + 1.45 * down)
+    figure = style.figure(size[0], 0.5 + size[1] * down)
     axes = figure.subplots(down, across, sharey=True, squeeze=False).flat
     for axis, (name, row) in zip(axes, scores.items(), strict=False):
         for label, colour, mark in zip(labels, COLOURS, "so", strict=False):

@@ -20,7 +20,10 @@ FOLDER = Path(__file__).with_name("weights")
 PACKAGE = "starjax_weights"
 CHECKOUT = Path(__file__).parents[3] / "weights"
 # Policies of the core's tasks; those of add-ons' tasks are in their tables.
-CORE = ("compact", "demo", "needle_pick", "peg_transfer_bimanual", "peg_transfer_robust")
+CORE = (
+    "compact", "demo", "needle_handover", "needle_pick", "peg_transfer_bimanual",
+    "peg_transfer_robust",
+)  # fmt: skip
 _SUFFIX = ".safetensors"
 _INSTALL = "in a checkout of starjax: pip install -e ./weights"
 

@@ -5,7 +5,7 @@ from starjax.core.extensions import AddOn
 _HERE = "starjax.addons.suture"
 TABLE = AddOn(
     "needles with a wrist through tissue, with a thread",
-    policies=("needle_drive",),
+    policies=("needle_drive", "suture_throw"),
     parts={
         "task": {
             "needle_regrasp": f"{_HERE}.needle_regrasp.task:TASK",
