@@ -4,7 +4,8 @@
     python experiments/pictures.py NAME ...   draws those of some pages
 
 A page's `picture` names a table (`of`), files of stresses (`levels`, with `labels`), or runs
-(`curves`, over the numbers `at` of the axis `x`). The digest of the drawn numbers stands in the picture's file; a test compares it with the results.
+(`curves`, over the numbers `at` of the axis `x`). The digest of the drawn numbers stands in the
+picture's file; a test compares it with the results.
 """
 
 import hashlib
