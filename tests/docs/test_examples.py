@@ -8,8 +8,8 @@ import pytest
 
 SHORT = {"11_ppo": ["--envs", "4", "--iterations", "2"]}
 MARKS = {  # some compile, or start a server
-    **{name: [pytest.mark.slow] for name in ("06_far_robot", "12_export")},
-    **{name: [pytest.mark.release] for name in ("04_closed_loop", "11_ppo")},
+    **{name: [pytest.mark.slow] for name in ("12_export",)},
+    **{name: [pytest.mark.release] for name in ("04_closed_loop", "06_far_robot", "11_ppo")},
 }
 PEERS = {"14_serve_lerobot"}  # needs LeRobot: tests/addons/peers/lerobot_closed_loop.py runs it
 

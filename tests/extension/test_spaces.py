@@ -1,5 +1,6 @@
 """A stranger's action space of each kind: data, executor, agent, robot, environment."""
 
+import functools
 import importlib
 import pathlib
 import sys
@@ -51,6 +52,7 @@ def wrist_of(name):
     return normalizer.wrist_of(METHODS[name], held(name))
 
 
+@functools.cache
 def fitted(name):
     return normalizer.fit(METHODS[name], held(name), fakes.dataset(0), FRAMES)
 

@@ -62,17 +62,18 @@ def seen(model, params, images):
 
 def test_colours_and_depth_have_networks_of_their_own(views):
     model = made(SETTINGS)
-    params = model.init(jax.random.key(0))
+    params = jax.jit(model.init)(jax.random.key(0))
     assert {"vision", "depth"} < set(params)
     images = jnp.zeros((1, 2, 2, CROP, CROP, 3))
     cut = augment.center(views[:1], crop=CROP)
-    before, after = (seen(model, params, x) for x in (images, images.at[:, :, 1].set(cut)))
+    see = jax.jit(lambda images: seen(model, params, images))
+    before, after = (see(x) for x in (images, images.at[:, :, 1].set(cut)))
     assert before.shape == (1, 2, 2 * SETTINGS.vision_dim)
     np.testing.assert_array_equal(*(x[..., : SETTINGS.vision_dim] for x in (before, after)))
     assert np.abs(before - after)[..., SETTINGS.vision_dim :].max() > 1e-3
     # Without the setting one network reads both.
-    both = made(dataclasses.replace(SETTINGS, depth_encoder="")).init(jax.random.key(0))
-    assert "depth" not in both
+    both = made(dataclasses.replace(SETTINGS, depth_encoder=""))
+    assert "depth" not in jax.eval_shape(both.init, jax.random.key(0))
 
 
 def test_an_encoder_of_depth_is_refused_for_colours_and_reads_depth_alone():
@@ -80,7 +81,7 @@ def test_an_encoder_of_depth_is_refused_for_colours_and_reads_depth_alone():
     with mistakes.of("policy.encoder", "points"):
         made(settings)
     alone = made(settings, features.Sensors(fakes.TASK, ("camera_depth",)))
-    params = alone.init(jax.random.key(0))
+    params = jax.jit(alone.init)(jax.random.key(0))
     assert "depth" not in params
     trunk = params["vision"]["params"]["trunk"]
     cast = made(

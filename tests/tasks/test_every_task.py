@@ -30,8 +30,8 @@ EXPERTS = {  # control steps
 }
 # The script with two arms has no second try, and drops a block now and then.
 DROPS = {"peg_transfer_bimanual": 1}
-# needle_drive, needle_handover and needle_pick stand for them in each run.
-LONG = {"needle_regrasp", "suture_throw", "peg_transfer_bimanual", "ring_on_wire"}
+# needle_handover and needle_pick stand for them in each run.
+LONG = {"needle_drive", "needle_regrasp", "suture_throw", "peg_transfer_bimanual", "ring_on_wire"}
 # A pad that lies across the arc touches more of its segments than are kept, the nearest.
 CROWDED = {"needle_pick", "needle_handover", "needle_regrasp"}
 LOOKS = 10  # control steps between two looks at all contacts

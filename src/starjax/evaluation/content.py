@@ -121,11 +121,6 @@ class _ErrorsMm(msgspec.Struct, kw_only=True):
     p99_of_successes: float | None = None
 
 
-class _Steps(msgspec.Struct):
-    mean: float | None = None
-    median: float | None = None
-
-
 class _Policy(msgspec.Struct):
     ddim_steps: int | None = None
 
@@ -175,7 +170,7 @@ class _Content(msgspec.Struct, kw_only=True):
     dirty: bool | None = None
     version: str | None = None
     rcm_error_mm: dict[str, _ErrorsMm] | None = None
-    steps: _Steps | None = None
+    steps: dict[str, float | None] | None = None
     inference_ms: Milliseconds | None = None
     inference_ms_by_ddim_steps: dict[str, Milliseconds] | None = None
     roll_network_ms: Milliseconds | None = None

@@ -72,7 +72,7 @@ def test_a_proportional_controller_reaches_and_rests(env):
     assert reward.dtype == done.dtype == jnp.float32
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_lane_begun_again_as_playground_does_has_its_first_trocar(env):
     """`wrap_for_brax_training` puts data and observation of the first reset in a finished lane.
 

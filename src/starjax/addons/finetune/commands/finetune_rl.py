@@ -3,7 +3,7 @@
 import functools
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -19,18 +19,6 @@ from starjax.runtime import files, precompile
 
 STREAM = 0x726C  # stream of its starts, folded into the seed's key, then the number of the round
 ALONE = 1  # first iterations, in which the critic learns alone
-
-
-class GradientProgress(NamedTuple):
-    """State between rounds.
-
-    Attributes:
-      learning: parameters, optimiser and critic; None before the first iteration.
-      noise: deviation of the plans' displacements.
-    """
-
-    learning: policy_gradient.Learning | None
-    noise: float
 
 
 class PolicyGradient:
@@ -52,8 +40,9 @@ class PolicyGradient:
             finetune_stages.Lessons(work).demonstrations(), config.train.holdout_demos
         )
         self._prepared = precompile.start(lambda: self._prepare(player, *shapes))
-        # The key is the policy file that the last round has made.
-        self._progress: dict[Path, GradientProgress] = {}
+        # The policy file of the last round -> parameters, optimiser and critic, which are None
+        # before the first iteration, and the deviation of the plans' displacements.
+        self._progress: dict[Path, tuple[policy_gradient.Learning | None, float]] = {}
 
     def round(self, number: int, who: PolicyInEnv, before: Path) -> finetune_stages.Round:
         """Runs the iterations of a round from the weights of a file, unless they are done."""
@@ -68,20 +57,20 @@ class PolicyGradient:
         with stage_times.timed(self._work.out, f"round {number} policy gradient"):
             old = policy_file.load(before)
             player = _player(old)
-            progress = self._progress.get(before)
-            if progress is None:
+            learning, noise = self._progress.get(before, (None, None))
+            if noise is None:
                 counts["noise_levels"] = self._tried(number, player)
-                progress = GradientProgress(None, noise_level.chosen(counts["noise_levels"]))
-            counts["noise"] = progress.noise
-            for learning, row in self._iterate(number, player, progress):
-                progress = progress._replace(learning=learning)
+                noise = noise_level.chosen(counts["noise_levels"])
+            counts["noise"] = noise
+            for after, row in self._iterate(number, player, learning, noise):
+                learning = after
                 counts["iterations"].append(row)
                 files.write_json(told, counts)  # those of a stopped round, too
-        learned = progress.learning.params if progress.learning else {}
+        learned = learning.params if learning else {}
         params = {**old.params, **jax.device_get(learned)}
         # With the reach of the rounds the validation's program is that of the policy itself.
         policy_file.save(file, old._replace(params=params, normalizer=player.stats, monitor=None))
-        self._progress = {file: progress}
+        self._progress = {file: (learning, noise)}
         return file, counts
 
     def _prepare(self, who: PolicyParams, played: explore.Experience) -> None:
@@ -109,13 +98,17 @@ class PolicyGradient:
         return tried
 
     def _iterate(
-        self, number: int, who: PolicyParams, progress: GradientProgress
-    ) -> Iterator[tuple[policy_gradient.Learning, dict[str, Any]]]:
+        self,
+        number: int,
+        who: PolicyParams,
+        learning: policy_gradient.Learning | None,
+        noise: float,
+    ) -> Iterator[tuple[policy_gradient.Learning | None, dict[str, Any]]]:
         """Yields the state of the learning after each iteration, and its figures."""
-        settings, noise = self._work.settings, progress.noise
+        settings = self._work.settings
         key_reset, key_play, key_learn = self._keys(number)
         draws = np.random.default_rng([settings.seed, STREAM, number])
-        learning, failed = progress.learning, np.zeros((0, 2), np.int32)
+        failed = np.zeros((0, 2), np.int32)
         alone = ALONE if learning is None else 0
         for i in range(settings.iterations):
             if self._work.is_late():
