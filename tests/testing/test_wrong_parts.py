@@ -128,10 +128,31 @@ def test_an_expert_that_ignores_the_trocar(reach, error, is_wrong):
         errors=np.full((16, 100), error),
         still=np.zeros((16, 100), bool),
         finite=np.ones(16, bool),
+        apart=np.full(16, error),
         wall_s=1.0,
     )
     wrong = faults(task_checks._outcomes(env, "expert default", ran))
     assert ("63" in wrong.get("expert default", "")) == is_wrong
+    assert ("63" in wrong.get("expert default, recorded commands", "")) == is_wrong
+
+
+@pytest.mark.parametrize("is_reversed", [False, True])
+def test_a_reversed_reward(reach, is_reversed):
+    env, states = reach
+    at_goal = states.measurements.replace(tip=states.layout.p, speed=jnp.zeros(16))
+    last = states.replace(measurements=at_goal, success=jnp.ones(16, bool))
+    if is_reversed:
+        real = env.task.status
+        worth = lambda status: status._replace(reward=1.0 - status.reward)  # noqa: E731
+        env = env._replace(task=env.task._replace(status=lambda *of: worth(real(*of))))
+    lines = list(task_starts.unrewarded(env, last))
+    assert len(lines) == is_reversed and all("0 at success" in line for line in lines)
+
+
+def test_one_layout_for_all_keys(reach):
+    env, states = reach
+    same = states.replace(layout=jax.tree.map(lambda x: jnp.repeat(x[:1], 16, 0), states.layout))
+    assert "one layout" in faults(task_starts.judged(env, same))["start"]
 
 
 # Learners: a linear model, small enough to train in a moment.
@@ -175,6 +196,8 @@ def linear(fault=""):
             low, high = (-1.0, 1.0) if reach is None else reach
             y = jnp.clip(predict(params, condition), low, high)
             y = 0.0 * y if fault == "samples at rest" else y
+            y = y[:, ::-1] if fault == "reversed in time" else y
+            y = y[..., [1, 0, *range(2, sizes.action)]] if fault == "action 1" else y
             return 1e3 * y if fault == "in mm" else y
 
         return SequenceModel(init, lambda key, x0: x0, loss, sample)
@@ -192,6 +215,8 @@ LEARNERS = {
     "away from the target": "training, of images",
     "samples at rest": "training, of images",
     "loss of one step": "training, of images",
+    "reversed in time": "training, of images",
+    "action 1": "training, of images",
     "in mm": "samples, of images",
 }
 
@@ -201,6 +226,8 @@ def test_learners(fault):
     wrong = found("learner", linear(fault))
     assert (LEARNERS[fault] in wrong) == bool(fault), wrong
     assert fault or not wrong
+    if fault in ("reversed in time", "action 1"):
+        assert fault in wrong["training, of images"]
 
 
 # Encoders.
@@ -313,6 +340,23 @@ def test_a_disturbance_that_sets_success():
 
     kind = DISTURBANCES.get("breathing")._replace(on_step=on_step)
     assert "success" in found("disturbance", kind)
+
+
+@pytest.mark.parametrize(("scale", "count"), [(1.0, 0), (255.0, 1), (np.nan, 1)])
+def test_images_of_disturbances(scale, count):
+    kind = DISTURBANCES.get("smoke")
+    worse = lambda *of: jnp.where(of[0].level > 0, scale, 1.0) * kind.on_image(*of)  # noqa: E731
+    lines = list(disturbance_checks._images(kind._replace(on_image=worse)))
+    assert len(lines) == count
+
+
+def test_a_disturbance_that_stops_time():
+    ends = dict.fromkeys(("success", "lost", "invalid"), np.zeros((), bool))
+    for step, count in ((0, 1), (disturbance_checks.STEPS + disturbance_checks.HOLD, 0)):
+        state = {**ends, "step": np.int32(step)}
+        assert len(list(disturbance_checks._stopped((state, None)))) == count
+    state |= {"step": np.int32(9), "lost": np.ones((), bool)}
+    assert not list(disturbance_checks._stopped((state, None)))
 
 
 @pytest.mark.parametrize("levels", [(), (1.0, 2.0), (0.0, 2.0, 1.0), (0.0, np.nan)])

@@ -36,6 +36,7 @@ class ExpertEpisodes(NamedTuple):
       errors: `[N, T]` m, executed RCM error of the arm that is farthest off.
       still: `[N, T]` bool, the command to record is nearly that of the step before.
       finite: `[N]` bool, the task's state was finite at every step.
+      apart: `[N]` m, largest distance between executed and recorded tips.
       wall_s: s to compile and run.
     """
 
@@ -45,6 +46,7 @@ class ExpertEpisodes(NamedTuple):
     errors: np.ndarray
     still: np.ndarray
     finite: np.ndarray
+    apart: np.ndarray
     wall_s: float
 
 
@@ -169,33 +171,35 @@ def _pairs(scene: scenes.Scene, state: EnvState) -> dict[str, jax.Array]:
 
 def _episode(
     env: envs.Env, agent: Agent, key: jax.Array, trocar: rcm.Trocar, steps: int
-) -> tuple[EnvState, Command, EnvState, jax.Array, jax.Array, jax.Array]:
+) -> tuple[EnvState, Command, EnvState, jax.Array, jax.Array, jax.Array, jax.Array]:
     key_reset, key_expert = jax.random.split(key)
     first = env.reset(key_reset, envs.EnvParams(trocar))
 
     def step(carry: Any) -> Any:
-        state, memory, _, hit, largest, before, still, finite = carry
+        state, memory, _, hit, largest, before, still, finite, apart = carry
         command, memory, label = agent.act(memory, state)
         after = env.step(state, command)
         is_first = after.collided & ~state.collided
         hit = jax.tree.map(lambda new, old: jnp.where(is_first, new, old), after, hit)
         largest = largest.at[state.step].set(jnp.max(after.rcm_error))
         still = still.at[state.step].set(stillness.is_still(before, label))
-        return after, memory, command, hit, largest, label, still, finite & _is_finite(env, after)
+        offset = jnp.linalg.norm(command.pose.p - label.pose.p, axis=-1)
+        apart, finite = jnp.maximum(apart, jnp.max(offset)), finite & _is_finite(env, after)
+        return after, memory, command, hit, largest, label, still, finite, apart
 
     memory = agent.init(key_expert, first)
     has_angles = jax.eval_shape(agent.act, memory, first)[0].wrist is not None
     hold = Command(first.pose, first.gripper, first.wrist if has_angles else None)
     start = (
         *(first, memory, hold, first),
-        *(jnp.zeros(steps), hold, jnp.zeros(steps, bool), _is_finite(env, first)),
+        *(jnp.zeros(steps), hold, jnp.zeros(steps, bool), _is_finite(env, first), jnp.zeros(())),
     )
-    state, _, command, hit, largest, _, still, finite = jax.lax.while_loop(
+    state, _, command, hit, largest, _, still, finite, apart = jax.lax.while_loop(
         lambda carry: ~carry[0].done & (carry[0].step < steps), step, start
     )
     # Memories of disturbances hold keys, which no array on the host can.
     state, hit = (one.replace(wrapper_state={}) for one in (state, hit))
-    return state, command, hit, largest, still, finite
+    return state, command, hit, largest, still, finite, apart
 
 
 def _is_finite(env: envs.Env, state: EnvState) -> jax.Array:

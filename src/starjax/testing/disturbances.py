@@ -22,6 +22,7 @@ TASK = "reach"
 STEPS = 8  # control steps of an episode that moves down
 HOLD = 40  # control steps at rest, longer than success takes
 DOWN = jnp.array([0.0, 0.0, -0.001])  # m a control step
+BRIGHTEST = 2.0  # mean of an image's numbers, which are cut to [0, 1] afterwards
 TOLERANCE = 1e-5  # m, rad: two compiled programs round differently
 SIDE = 32  # pixels
 # Compared of a state.
@@ -51,7 +52,7 @@ def check(name: str, n: int) -> Iterator[Check]:
         "levels", _levels(kind), f"{len(kind.levels)} up to {kind.levels[-1]:g} {kind.unit}"
     )
     if kind.on_image is not None:
-        yield verdict("images", _images(kind), "as they were at level 0")
+        yield verdict("images", _images(kind), "as they were at level 0, finite and in range")
     if kind.seen_step is not None:
         yield verdict("seen steps", _seen_steps(kind), "the same at level 0, never later ones")
     env = envs.make(TASK, observation="state")
@@ -63,7 +64,8 @@ def check(name: str, n: int) -> Iterator[Check]:
         return
     plain, none, most = runs
     yield verdict("level 0", _differences(plain, none), "changes nothing")
-    yield verdict(f"level {kind.levels[-1]:g}", _not_finite(most), "finite numbers")
+    faults = [*_not_finite(most), *_stopped(most)]
+    yield verdict(f"level {kind.levels[-1]:g}", faults, "finite numbers, time advances")
     yield verdict("success", _easier(plain, most), "none without an agent")
     if not kind.image_only and not any(_differences(plain, most)):
         yield Check("effect", f"none on {STEPS + HOLD} steps of {TASK} at the highest level", NOTE)
@@ -88,6 +90,11 @@ def _images(kind: Disturbance) -> Iterator[str]:
             yield f"on_image: expected {list(image.shape)}, got {list(changed.shape)}"
         elif not level and not np.array_equal(changed, image):
             yield "on_image changes them at level 0"
+        real = image.astype(jnp.float32) / 255.0
+        mean = float(jnp.mean(kind.on_image(state, real, jnp.zeros((), jnp.int32))))
+        if not abs(mean) <= BRIGHTEST:
+            got = f"got {mean:.3g}"
+            yield f"on_image: expected a mean of 0 to 1 (at most {BRIGHTEST:g}) at {level:g}, {got}"
 
 
 def _seen_steps(kind: Disturbance) -> Iterator[str]:
@@ -138,6 +145,14 @@ def _easier(plain: Any, most: Any) -> Iterator[str]:
         if bool(most[0][name]) and not bool(plain[0][name]):
             seconds = (STEPS + HOLD) / CONTROL_HZ
             yield f"{name} at the highest level of an arm that holds for {seconds:.1f} s"
+
+
+def _stopped(episode: Any) -> Iterator[str]:
+    """Yields a fault if an episode that is not over has had fewer steps than commands."""
+    state, _ = episode
+    is_over = any(bool(state[name]) for name in ("success", "lost", "invalid"))
+    if not is_over and (step := int(state["step"])) != STEPS + HOLD:
+        yield f"the state is at step {step} after {STEPS + HOLD} commands"
 
 
 def _not_finite(episode: Any) -> Iterator[str]:

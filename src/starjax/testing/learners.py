@@ -26,10 +26,12 @@ SIZES = {
     "of the state": Sizes(horizon=16, action=5, obs_horizon=2, vision=0, state=8, trocar=0),
     "of images": Sizes(horizon=16, action=10, obs_horizon=2, vision=12, state=8, trocar=7),
 }
-STEPS = 100  # steps of a short training
+STEPS = 300  # steps of a short training
 LEARNING_RATE = 1e-3
-TARGET = 0.5  # every number of a learned sequence, of either sign: the condition says which
+TARGET = 0.5  # amplitude of a learned sequence, of either sign: the condition says which
 NEARER = 0.02  # fraction of the mean action's error by which the samples' must be smaller
+# Share by which samples may follow another action, or time, more than their own.
+MISPLACED = 0.1
 SEEN = 1e-6  # least change of a sample
 TOLERANCE = 1e-4  # between a sample in one batch and in another
 
@@ -87,21 +89,48 @@ def _values(text: str, model: SequenceModel, sizes: Sizes) -> Iterator[Check]:
     if not sizes.vision or not np.isfinite(loss) or faults:
         return
     sides = jnp.where(jnp.arange(BATCH) // COPIES % 2, 1.0, -1.0)[:, None, None]
-    target = jnp.broadcast_to(TARGET * sides, x0.shape)
+    waves = _waves(sizes.horizon, sizes.action)
+    target = TARGET * sides * waves
     given = [prepare(key, target) for key in jax.random.split(jax.random.key(5), STEPS)]
     trained, losses = _trained(learned, params, given)
     other = float(learned(trained, prepare(jax.random.key(5), -target))[0])
     own = float(learned(trained, prepare(jax.random.key(5), target))[0])
-    error = abs(1.0 - float((drawn(trained, condition) * sides).mean()) / TARGET)
+    shape = (drawn(trained, condition) * np.asarray(sides)).mean(0) / TARGET
+    error = abs(1.0 - float((shape * waves).sum() / (waves**2).sum()))
     figures = f"samples have {error:.2f} of the mean action's error after {STEPS} steps"
     faults = list(_unlearned(losses, error))
     if not other > own:
         faults.append(f"the loss is {own:.3g} for learned sequences and {other:.3g} for others")
     value = jax.jit(lambda x: model.loss(params, condition, model.prepare(keys[0], x))[0])
-    faults += _ignored(value, x0)
+    faults += [*_ignored(value, x0), *_misplaced(shape, waves)]
     yield verdict(f"training, {text}", faults, figures)
     blind = _blind(functools.partial(drawn, trained), condition)
     yield verdict(f"input, {text}", blind, "samples follow it")
+
+
+def _waves(horizon: int, actions: int) -> np.ndarray:
+    """Returns orthogonal sequences `[H, D]`, a cosine per action; half change sign in reverse."""
+    steps = np.arange(horizon)[:, None] + 0.5
+    return np.cos(np.pi * steps * np.arange(1, actions + 1) / horizon)
+
+
+def _misplaced(shape: np.ndarray, waves: np.ndarray) -> Iterator[str]:
+    """Yields faults of mean samples `[H, D]` that follow `waves` `[H, D]` in another order."""
+
+    def follows(waves: np.ndarray) -> np.ndarray:
+        """Returns `[D, D]`, the share of each wave in each action of the samples."""
+        return 2.0 / len(waves) * waves.T @ shape
+
+    shares = follows(waves)
+    own, back = np.diagonal(shares), np.diagonal(follows(waves[::-1]))
+    if (back - own).max() > MISPLACED:
+        text = f"{back.mean():.2f} reversed in time, by {own.mean():.2f} in order"
+        yield f"samples follow learned sequences by {text}"
+        return
+    for i in np.flatnonzero(shares.max(0) - own > MISPLACED):
+        other = shares[:, i].argmax()
+        text = f"{shares[other, i]:.2f}, its own one by {own[i]:.2f}"
+        yield f"action {i} of samples follows the learned action {other} by {text}"
 
 
 def _trained(

@@ -43,7 +43,9 @@ def judged(env: Env, states: EnvState) -> Iterator[Check]:
     counts = {"success": int(np.sum(status.success_now)), "lost": int(np.sum(status.lost))}
     faults = [f"{name} at step 0 in {n} of {count} resets" for name, n in counts.items() if n]
     faults += _out_of_range(env, status)
-    yield verdict("start", faults, f"no success in {count} resets")
+    if all(np.all(leaf == leaf[:1]) for leaf in map(np.asarray, jax.tree.leaves(states.layout))):
+        faults.append(f"one layout in {count} resets with different keys")
+    yield verdict("start", faults, f"no success in {count} resets, layouts differ")
     tips = np.asarray(states.pose.p)
     yield verdict("state", _unit_faults(env, fields, tips), "finite, points in m of the workspace")
 
@@ -71,6 +73,27 @@ def _unit_faults(env: Env, states: np.ndarray, tips: np.ndarray) -> Iterator[str
             away = np.linalg.norm(points - tips[:, None], axis=-1).min(-1)
             if (far := float(away.max())) > FARTHEST:
                 yield f"{field.name} is {far:.3g} m from the tips, at most {FARTHEST:g}: in mm?"
+
+
+def unrewarded(env: Env, last: EnvState) -> Iterator[str]:
+    """Yields a fault if a success is worth no more than the start, where a still arm stays.
+
+    Args:
+      last: EnvState `[N]` at the end of episodes.
+    """
+    ended = np.flatnonzero(np.asarray(last.success))
+    if not len(ended):
+        return
+
+    def reward(layout: ArrayTree, measurements: ArrayTree) -> jax.Array:
+        return env.task.status(env.scene.bound, layout, measurements).reward
+
+    first = resets(env)
+    start = float(np.max(jax.vmap(reward)(first.layout, first.measurements)))
+    rows = jax.tree.map(lambda x: jnp.asarray(x)[ended], (last.layout, last.measurements))
+    success = float(np.min(jax.vmap(reward)(*rows)))
+    if not success > start:
+        yield f"{success:.3g} at success, {start:.3g} at reset"
 
 
 def hidden_goals(env: Env, last: EnvState) -> Iterator[str]:

@@ -34,6 +34,7 @@ from starjax.testing.base import (
 
 SEED = 0
 MAX_RCM_ERROR = 1e-3  # m, executed by an expert
+MAX_APART = 0.02  # m, from an expert's executed tip to its recorded one: a disturbance to correct
 FARTHEST = 1.0  # m from the world's origin to a nominal trocar
 
 
@@ -221,6 +222,11 @@ def _outcomes(env: envs.Env, subject: str, ran: episodes.ExpertEpisodes) -> Iter
         )
         yield failed(subject, text)
     yield verdict(f"{subject}, goal", task_starts.hidden_goals(env, ran.last), "in the state")
+    yield verdict(f"{subject}, reward", task_starts.unrewarded(env, ran.last), "more at success")
+    apart = float(ran.apart.max())
+    text = f"up to {1e3 * apart:.1f} mm from executed ones"
+    faults = [f"{text}, at most {1e3 * MAX_APART:g} mm"] * (not apart <= MAX_APART)
+    yield verdict(f"{subject}, recorded commands", faults, text)
     if not ran.finite.all():
         yield failed(subject, f"{_fields(env, ran)} in {int((~ran.finite).sum())} episodes")
     waiting = ~(success | last.lost | last.invalid)

@@ -9,6 +9,7 @@ from starjax.addons.formats import base as formats
 from starjax.addons.formats import part_check
 from starjax.testing.base import FAILED
 
+LOST = {"task": "", "robot": "", "splits": {}}
 ORDERS = {"episodes": lambda i: -i, "sorted as text": str}
 
 
@@ -36,6 +37,8 @@ def format_of(fault, tmp_path):
         lengths = [source.lengths[i] for i in order]
         origin = None if fault == "origin" else source.origin
         changed = source._replace(read=read, columns=columns, lengths=lengths, origin=origin)
+        if fault in LOST:
+            changed = changed._replace(**{fault: LOST[fault]})
         zarr.write(path, changed, video)
         path.joinpath("of_mine").touch()
 
@@ -58,6 +61,7 @@ def format_of(fault, tmp_path):
 FAULTS = [
     *("", "names", "order", "nan", "integers", *ORDERS, "origin", "any folder"),
     *("blank video", "read alone"),
+    *LOST,
 ]
 
 
@@ -70,3 +74,9 @@ def test_formats(monkeypatch, tmp_path, fault):
     monkeypatch.setattr(formats, "FORMATS", formats.FORMATS._replace(built_in=rows))
     failed = [check for check in part_check.check("mine", 1) if check.status == FAILED]
     assert bool(failed) == bool(fault)
+    assert fault not in LOST or all(f"{fault}: expected" in check.text for check in failed)
+
+
+@pytest.mark.parametrize("name", ["robomimic", "zarr"])
+def test_own_formats(name):
+    assert not [check for check in part_check.check(name, 1) if check.status == FAILED]

@@ -14,6 +14,7 @@ from starjax.testing.base import NOTE, Check, attempt, failed, verdict
 
 LENGTHS = (5, 3, *(2,) * 9)  # control steps of episodes, whose names may be sorted as text
 HZ = 30.0
+SPLITS = {"train": range(9), "test": range(9, 11)}
 SIDE = 48  # pixels
 LOST = 8.0  # mean difference of a video from its smooth images
 # Ends of file names that a format may be recognised by, the usual ones.
@@ -76,7 +77,7 @@ def _is_taken(form: Format, out: Path, suffix: str) -> bool:
 
 def _differences(name: str, source: Source, out: Path, video: bool) -> Iterator[str]:
     with base.open_dataset(out, name) as found:
-        for field in ("lengths", "hz", "origin"):
+        for field in ("lengths", "hz", "origin", "task", "robot", "splits"):
             expected, got = getattr(source, field), getattr(found, field)
             if list(got) != list(expected) if field == "lengths" else got != expected:
                 yield f"{field}: expected {expected}, got {got}"
@@ -135,7 +136,7 @@ def _source(form: Format) -> Source:
         return {name: arrays[episode][name] for name in names}
 
     origin = {"schema": 1, "digest": "none", "description": {"control_hz": HZ}}
-    return Source(HZ, list(LENGTHS), columns, read, origin, "check", "none")
+    return Source(HZ, list(LENGTHS), columns, read, origin, "check", "none", splits=SPLITS)
 
 
 def _call(name: str, function: str, call: Callable[[], Any]) -> Any:

@@ -80,8 +80,9 @@ def _open(path: Path) -> Iterator[Source]:
             base.require(isinstance(origin, dict), f"a map in {base.OURS}", type(origin).__name__)
         about = _attribute(data, "env_args")
         hz = base.origin_hz(origin) or float(_hz(about))
-        task = str(about.get("env_name", ""))
-        yield Source(hz, lengths, columns, read, origin, task, faults=faults)
+        task, splits = str(about.get("env_name", "")), _splits(file, demos)
+        robot = str((about.get("env_kwargs") or {}).get("robot", ""))
+        yield Source(hz, lengths, columns, read, origin, task, robot, splits=splits, faults=faults)
 
 
 def _write(path: Path, source: Source, video: bool) -> None:
@@ -106,11 +107,26 @@ def _write(path: Path, source: Source, video: bool) -> None:
         data.attrs["total"] = sum(source.lengths)
         about = {"env_name": source.task, "env_type": 2, "env_kwargs": {"robot": source.robot}}
         data.attrs["env_args"] = np.bytes_(json.dumps(about | {"control_freq": source.hz}))
-        file.create_dataset("mask/train", data=np.array(names, h5py.string_dtype()))
+        for split, part in (source.splits or {"train": range(len(names))}).items():
+            some = np.array(names[part.start : part.stop], h5py.string_dtype())
+            file.create_dataset(f"mask/{split}", data=some)
         if source.origin:
             # Bytes of a dataset: attributes hold 64 kB, and a damaged string hangs HDF5.
             text = json.dumps(source.origin).encode()
             file.create_dataset(base.OURS, data=np.frombuffer(text, np.uint8))
+
+
+def _splits(file: "h5py.File", demos: list[Any]) -> dict[str, range]:
+    """Returns the masks whose episodes follow one another."""
+    numbers = {demo.name.rpartition("/")[2].encode(): i for i, demo in enumerate(demos)}
+    masks: Any = file.get("mask", {})
+    splits = {}
+    for name, mask in masks.items():
+        listed = np.ravel(mask[()]).tolist() if _is_data(mask) else []
+        rows = [numbers.get(one, -1) for one in listed]
+        if rows and rows == [*range(max(rows[0], 0), max(rows[0], 0) + len(rows))]:
+            splits[name] = range(rows[0], rows[0] + len(rows))
+    return splits
 
 
 def _recognises(path: Path) -> bool:

@@ -68,7 +68,9 @@ def _open(path: Path) -> Iterator[Source]:
         origin = about.get(base.OURS)
         hz = base.origin_hz(origin) or float(about.get("hz", 0.0))
         lengths, task = (ends - starts).tolist(), str(about.get("task", ""))
-        yield Source(hz, lengths, columns, read, origin, task, notes=notes)
+        splits = {name: range(*ends) for name, ends in about.get("splits", {}).items()}
+        robot = str(about.get("robot", ""))
+        yield Source(hz, lengths, columns, read, origin, task, robot, notes, splits)
 
 
 @contextlib.contextmanager
@@ -117,10 +119,9 @@ def _write(path: Path, source: Source, video: bool) -> None:
         buffer.flush()
     ends = np.cumsum(source.lengths, dtype=np.int64)
     meta.create_array("episode_ends", data=ends, compressors=None)
-    names = base.names_of(source)
-    root.attrs.update(
-        {"hz": source.hz, "names": names, "task": source.task, base.OURS: source.origin}
-    )
+    splits = {name: [part.start, part.stop] for name, part in source.splits.items()}
+    about = {"hz": source.hz, "names": base.names_of(source), "task": source.task}
+    root.attrs.update(about | {"robot": source.robot, "splits": splits, base.OURS: source.origin})
 
 
 class _Buffer:
