@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from starjax.core.types import Pose
 from starjax.deploy import guard
@@ -157,6 +158,13 @@ def test_the_first_command_is_compared_with_the_setpoint():
     (doubt,) = guard.check_first(aside(TIP, 0.326), TIP)
     assert doubt.kind == "arm" and "326 mm" in doubt.text
     assert guard.check_first(aside(TIP, np.nan), TIP)
+
+
+@pytest.mark.parametrize(("angle", "count"), [(0.09, 0), (0.11, 1), (np.pi, 1), (np.nan, 1)])
+def test_a_first_command_with_other_axes_is_a_doubt(angle, count):
+    turn = Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix() if angle == angle else np.nan
+    doubts = guard.check_first(Pose(TIP.R @ (turn * np.eye(3)), TIP.p), TIP)
+    assert len(doubts) == count and all(doubt.name == "first command" for doubt in doubts)
 
 
 def test_the_page_has_a_row_for_each():

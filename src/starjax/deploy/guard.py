@@ -19,6 +19,7 @@ MAX_FOLLOWING = 0.004  # m, from the measured tip to the nearest of the last com
 MAX_AGE_S = 0.2  # age of measurements and images
 MAX_MOVED = 0.001  # m, of a measured trocar since the plans began
 MAX_FIRST = 0.003  # m, from a robot's setpoint to the first command
+MAX_FIRST_TURN = 0.1  # rad, likewise: more is another convention of axes
 MAX_FUTURE_S = 0.02  # s, by which stamps may be ahead of the clock
 MAX_MISFIT = 0.002  # m, between a measured tip and that of the measured joints
 MAX_SKEW = 0.05  # deviation of R'R from the identity, far above rounding and calibration errors
@@ -176,11 +177,13 @@ def check_first(command: Pose, setpoint: Pose, max_first: float = MAX_FIRST) -> 
     anything moves, without a calibration.
     """
     far = _distance(command.p, setpoint.p)
-    if far <= max_first:
-        return []
-    return [
-        Doubt("arm", "first command", f"{_mm(far)} from the setpoint, at most {_mm(max_first)}")
-    ]
+    turned = np.swapaxes(np.asarray(command.R, np.float64), -1, -2) @ setpoint.R
+    cosine = (np.trace(turned, axis1=-2, axis2=-1) - 1.0) / 2.0
+    angle = _most(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    texts = [f"{_mm(far)} from the setpoint, at most {_mm(max_first)}"] * (not far <= max_first)
+    if not angle <= MAX_FIRST_TURN:
+        texts.append(f"turned by {angle:.3g} rad from the setpoint, at most {MAX_FIRST_TURN:g}")
+    return [Doubt("arm", "first command", text) for text in texts]
 
 
 def off_trocar(shaft: Pose, p_world_trocar: ArrayLike) -> np.ndarray:

@@ -58,7 +58,8 @@ def main(domain: str, yaw: str = "0", kind: str = "psm", tool: str = "large_need
             elif word == "rival":
                 rivals.append(own.writer("/PSM1/servo_jp", messages.JointState, "servo"))
             is_over |= word == "end"
-    told = {"commands": arm.commands, "moved": arm.moved, "q": body.q.tolist(), "clock": arm.clock}
+    told = {"commands": arm.commands, "holds": arm.holds, "moved": arm.moved}
+    told |= {"q": body.q.tolist(), "clock": arm.clock}
     print(json.dumps(told), flush=True)
 
 

@@ -48,7 +48,7 @@ def test_a_doubt_silences_the_node(own_bus, tmp_path, line, name):
         sent = one.sent
         assert 15 * 4 <= sent < 8 * 120 * 0.6
         told = process.end()
-    assert told["commands"] <= sent and told["moved"] < 0.005
+    assert told["commands"] <= sent and told["moved"] < 0.005 and told["holds"] == 1
 
 
 def test_a_robot_that_is_killed_and_back_elsewhere_is_not_pulled(own_bus, tmp_path):
@@ -122,7 +122,7 @@ def test_a_wrong_base_is_found_by_the_setpoint(own_bus, tmp_path, monkeypatch):
         monkeypatch.setattr(one, "check_first", lambda command: [doubt])
         report = node.run(one, client, 1.0)
         assert report.fault == str(doubt) and report.silent == 1 and one.sent == 0
-        process.end()
+        assert process.end()["holds"] == 0  # the arm was not ours yet
 
 
 def test_a_second_node_is_refused_and_disturbs_nobody(own_bus, tmp_path):

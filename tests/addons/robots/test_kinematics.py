@@ -4,7 +4,7 @@ import mistakes
 import numpy as np
 import pytest
 
-from starjax.addons.robots import kinematics
+from starjax.addons.robots import kinematics, psm
 from starjax.core.types import Pose
 from starjax.sim import registries
 
@@ -20,7 +20,7 @@ def kin(request):
 def drawn(kin, spread):
     low, high = kin.limits.T
     q = kin.home + np.random.default_rng(0).uniform(-spread, spread, (10, len(kin.home)))
-    return np.clip(q, low + 0.02, high - 0.02)
+    return np.clip(q, low + 0.06, high - 0.06)
 
 
 def test_joints_of_a_tip_reach_it_from_the_joints_before(kin):
@@ -37,6 +37,25 @@ def test_a_tip_out_of_reach_is_refused(kin):
     tip = kin.tip_of(kin.home)
     with pytest.raises(kinematics.UsageError):
         kin.joints_of(Pose(tip.R, tip.p - 2.0 * tip.R[:, 2]), kin.home)
+
+
+@pytest.mark.parametrize("joint", [0, 2])
+def test_a_command_near_a_limit_may_only_leave_it(joint):
+    kin = kinematics.of("psm", "large_needle_driver", "peg_transfer")
+    high = kin.limits[joint, 1]
+    margin = 0.005 if joint == 2 else 0.05
+
+    def at(left):
+        return kin.home + (high - left - kin.home[joint]) * np.eye(6)[joint]
+
+    def move(before, after):
+        return kin.joints_of(kin.tip_of(at(after)), at(before))
+
+    np.testing.assert_allclose(move(2.0 * margin, 1.1 * margin), at(1.1 * margin), atol=1e-6)
+    np.testing.assert_allclose(move(0.5 * margin, 0.8 * margin), at(0.8 * margin), atol=1e-6)
+    for before, after in ((1.1, 0.9), (0.8, 0.5)):
+        with mistakes.of(psm.JOINTS[joint]):
+            move(before * margin, after * margin)
 
 
 def test_the_shaft_has_the_axis_of_a_straight_wrist(kin):

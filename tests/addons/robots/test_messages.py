@@ -52,6 +52,16 @@ def test_a_message_is_read_and_written_alike(store, message):
     assert_equal(message, theirs)
 
 
+@pytest.mark.parametrize("name", m.HASHES)
+def test_hashes_of_types_are_those_of_ros(store, name):
+    assert store.hash_rihs01(name) == f"RIHS01_{m.HASHES[name]}"
+
+
+def test_every_message_that_is_written_has_a_hash():
+    kinds = {m.name_of(type(one)) for one in FILLED} - {"std_msgs/msg/Header"}
+    assert kinds < m.HASHES.keys()
+
+
 def assert_equal(ours, theirs):
     if not dataclasses.is_dataclass(ours):
         if isinstance(ours, float):  # some are single on the wire

@@ -192,8 +192,9 @@ class CrtkArm:
         stamp = messages.stamp(self.bus.now())
         message = self._message(command, q, stamp)
         if not self._writers:
-            kinds = type(message), messages.JointState
-            for topic, kind in zip(self.commands, kinds, strict=True):
+            topics = [*self.commands, self.file.topic("hold")]
+            kinds = type(message), messages.JointState, messages.Empty
+            for topic, kind in zip(topics, kinds, strict=True):
                 self._writers[topic] = self.bus.writer(topic, kind, "servo")
         arm, jaw = self.commands
         self._writers[arm].write(message)
@@ -201,6 +202,11 @@ class CrtkArm:
         self._writers[jaw].write(crtk.fill_jaw(jaws, float(command.gripper), self.file.jaw))
         self._q = q
         self.sent += 1
+
+    def hold(self) -> None:
+        """Asks the robot to hold, by CRTK's `hold`, if it has had a command."""
+        if self._writers:
+            self._writers[self.file.topic("hold")].write(messages.Empty())
 
     def _message(self, command: Command, q: np.ndarray, stamp: messages.Time) -> Any:
         """Returns `servo_jp` or `servo_cp` of a command, with the frame in its header."""

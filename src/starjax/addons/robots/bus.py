@@ -2,6 +2,7 @@
 
 import functools
 import os
+import re
 import time
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -22,6 +23,9 @@ from starjax.addons.robots.robot_file import Network
 _BLOCKING = duration(milliseconds=20)  # wait of a reliable writer for a full reader
 _DEPTHS = {"default": 10, "servo": 1, "sensor": 5, "latched": 1}
 _URI = "CYCLONEDDS_URI"  # a user's own configuration replaces ours
+_HASH = re.compile(rb"typehash=RIHS01_(\w+);")  # in a writer's user data, since ROS 2 Iron
+# Promises of a reader that a writer may not make, by DDS's numbers.
+_PROMISES = {2: "durability", 11: "reliability"}
 _AT_ONCE = 20  # messages of a topic that a poll reads
 _CLOCK = "/clock"
 # s for which a simulator's clock may stand, as a slow one does. Then it follows the computer's, so
@@ -72,7 +76,9 @@ class Bus:
     def writer(self, topic: str, kind: type, profile: str = "default") -> DataWriter:
         """Opens a writer of a profile: default, servo, sensor or latched."""
         where = Topic(self._participant, f"rt{topic}", kind)
-        return DataWriter(self._participant, where, qos=_quality(profile, _DEPTHS[profile]))
+        about = Qos(Policy.Userdata(f"typehash={messages.type_hash(kind)};".encode()))
+        quality = _quality(profile, _DEPTHS[profile])
+        return DataWriter(self._participant, where, qos=quality + about)
 
     def poll(self) -> list[str]:
         """Reads all topics; returns those with a new message."""
@@ -84,7 +90,11 @@ class Bus:
             if not one.sample_info.valid_data:
                 self._others.pop(one.key, None)
             elif one.participant_key != self._participant.guid:
-                self._others[one.key] = (one.topic_name.removeprefix("rt"), one.type_name)
+                name, found = ros_name(one.type_name), one.qos[Policy.Userdata]
+                told = _HASH.search(found.data) if found else None
+                if told and told[1].decode() != messages.HASHES.get(name, told[1].decode()):
+                    name += " of another version"
+                self._others[one.key] = (one.topic_name.removeprefix("rt"), name)
         return fresh
 
     def _take(self, topic: str) -> bool:
@@ -105,7 +115,12 @@ class Bus:
 
         A killed writer counts for another 10 s, the time after which DDS gives a participant up.
         """
-        return [ros_name(kind) for where, kind in self._others.values() if where == topic]
+        return [kind for where, kind in self._others.values() if where == topic]
+
+    def unmatched(self, topic: str) -> str:
+        """Returns the promise of a reader that a writer does not make; empty if all match."""
+        status = self._readers[topic].get_requested_incompatible_qos_status()
+        return _PROMISES.get(status.last_policy_id, "profile") if status.total_count else ""
 
     def topics(self) -> list[str]:
         """Returns the topics of other participants' writers."""

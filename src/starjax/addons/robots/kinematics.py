@@ -15,6 +15,9 @@ INSTRUMENTS = {"large_needle_driver": psm.LARGE_NEEDLE_DRIVER, "prograsp": psm.P
 # The tools of the simulation that these instruments are.
 TOOLS = {"large_needle_driver": "needle_driver", "prograsp": "prograsp"}
 MAX_RESIDUAL = 5e-4  # m, of inverse kinematics: beyond it a pose is out of reach
+# rad and m: closer to a limit no command may go. A wrist may work at its limits.
+_MARGIN = 0.05
+_PSM_MARGINS = np.array([_MARGIN, _MARGIN, 0.005, _MARGIN, 0.0, 0.0])
 _ITERATIONS = 8  # from the joints of the last command
 
 
@@ -28,7 +31,8 @@ class Kinematics(NamedTuple):
       wrist: of the instrument, None of a straight one.
       pose_world_base: of the simulation's mount, None of a dVRK's arm, whose base is its trocar.
       tip_of, shaft_of: `[J]` -> pose in the base frame.
-      joints_of: (pose_base_tip, `[J]` near) -> `[J]` within the limits, or UsageError.
+      joints_of: (pose_base_tip, `[J]` near) -> `[J]` within the limits, or UsageError. One that
+        is near a limit may only leave it.
     """
 
     names: Sequence[Sequence[str]]
@@ -71,7 +75,7 @@ def of_psm(instrument: psm.Instrument) -> Kinematics:
     def joints_of(pose_base_tip: Pose, near: np.ndarray) -> np.ndarray:
         q = psm.joints_of(pose_base_tip, instrument)
         q = min((q, psm.half_turn(q)), key=lambda x: np.abs(x - near).max())
-        return _within(q, psm.LIMITS, psm.JOINTS)
+        return _within(q, near, psm.LIMITS, _PSM_MARGINS, psm.JOINTS)
 
     return Kinematics(
         psm.NAMES,
@@ -113,17 +117,26 @@ def of_chain(kind: str, tool: str, task: str) -> Kinematics:
         q, residual = jax.device_get(solve(pose, np.asarray(near, np.float32)))
         if not residual < MAX_RESIDUAL:
             raise UsageError("pose_base_tip", "a pose within reach", f"{1e3 * residual:.1f} mm off")
-        return _within(np.asarray(q, np.float64), bound.chain.limits, bound.arm.joints)
+        limits, margins = bound.chain.limits, np.full(len(q), _MARGIN)
+        return _within(np.asarray(q, np.float64), near, limits, margins, bound.arm.joints)
 
     return Kinematics(
         (bound.arm.joints,), bound.chain.limits, bound.home, None, mount, tip_of, tip_of, joints_of
     )
 
 
-def _within(q: np.ndarray, limits: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    beyond = np.flatnonzero(~((q >= limits[:, 0]) & (q <= limits[:, 1])))
-    if beyond.size:
-        j = int(beyond[0])
+def _within(
+    q: np.ndarray,
+    near: np.ndarray,
+    limits: np.ndarray,
+    margins: np.ndarray,
+    names: Sequence[str],
+) -> np.ndarray:
+    left, before = (np.minimum(x - limits[:, 0], limits[:, 1] - x) for x in (q, near))
+    bad = np.flatnonzero(~(left >= 0.0) | ((left < margins) & (left < before)))
+    if bad.size:
+        j = int(bad[0])
         low, high = limits[j]
-        raise UsageError(names[j], f"{low:.3g} to {high:.3g}, its limits", f"{q[j]:.3g}")
+        expected = f"{low:.3g} to {high:.3g}, its limits, less {margins[j]:g}"
+        raise UsageError(names[j], expected, f"{q[j]:.3g}")
     return q

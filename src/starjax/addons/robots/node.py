@@ -104,6 +104,7 @@ def run(
         last = command
         if command is None:
             reason = client.report.fault
+            arm.hold()
             shown.show(None, client)
             if should_stop() or not confirm(reason):
                 break

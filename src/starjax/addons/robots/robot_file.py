@@ -30,6 +30,7 @@ TOPICS = {
     "servo_cp": "servo_cp",
     "servo_jp": "servo_jp",
     "jaw_servo": "jaw/servo_jp",
+    "hold": "hold",
 }
 VIEW = "view"  # the frame of commands relative to the endoscope
 

@@ -101,7 +101,7 @@ class SimArm:
     Attributes:
       goal: `[J]`, the setpoint; jaw: in [-1, 1]. state: of `operating_state`.
       p_trocar: `[3]` m in the base frame, published. is_frozen: stamps stay.
-      moved: m, the largest step of the setpoint's tip so far. commands: received so far.
+      moved: m, the largest step of the setpoint's tip so far. commands, holds: received so far.
       clock: s, its own time: it stands while the process does. With `is_clocked` it stamps the
         messages and is published.
     """
@@ -111,7 +111,7 @@ class SimArm:
     ) -> None:
         self.body, self.goal, self.jaw = body, body.q.copy(), body.gripper
         self.state, self.p_trocar, self.is_frozen = "ENABLED", body.p_base_trocar, False
-        self.moved, self.commands, self.clock = 0.0, 0, time.time()
+        self.moved, self.commands, self.holds, self.clock = 0.0, 0, 0, time.time()
         self._bus, self._at, self._is_clocked = bus, namespace, is_clocked
         self._name = frame_of(namespace)
         wrist = body.kinematics.wrist
@@ -131,6 +131,7 @@ class SimArm:
         self._trocar = bus.writer("/trocar", messages.PointStamped, "latched")
         for name, kind in (("servo_cp", pose), ("servo_jp", joints), ("jaw/servo_jp", joints)):
             bus.read(f"{namespace}/{name}", kind)
+        bus.read(f"{namespace}/hold", messages.Empty)
 
     def run(self, seconds: float, should_stop: Callable[[], bool] = lambda: False) -> None:
         """Moves and serves, in real time where the computer keeps it."""
@@ -169,6 +170,10 @@ class SimArm:
         self._writers["warning"].write(messages.StringStamped(header, text))
 
     def _take(self, name: str, message: Any) -> None:
+        if name == "hold":
+            self.goal, self._commanded = self.body.hold(), np.inf
+            self.holds += 1
+            return
         if name == "jaw/servo_jp":
             self.jaw = crtk.opening_of(message, JAW)
             return

@@ -17,6 +17,7 @@ class TopicRow(NamedTuple):
       rate: messages per second.
       age: s since the newest one's stamp, None without one.
       is_command: True for a topic of commands, with no other writer.
+      unmatched: promise of the reader that a writer does not make, see `Bus.unmatched`.
     """
 
     topic: str
@@ -25,6 +26,7 @@ class TopicRow(NamedTuple):
     rate: float
     age: float | None
     is_command: bool = False
+    unmatched: str = ""
 
 
 def look(
@@ -50,6 +52,7 @@ def look(
             tuple(arm.bus.writers(source.topic)),
             counts[name] / seconds,
             None if name in missing else arm.age(name, now),
+            unmatched=arm.bus.unmatched(source.topic),
         )
         for name, source in arm.sources.items()
     ]
@@ -73,7 +76,8 @@ def problems(rows: list[TopicRow]) -> list[str]:
         elif len(row.found) > 1:
             out.append(f"{row.topic}: {len(row.found)} writers")
         elif row.age is None:
-            out.append(f"{row.topic}: no message: compare the profiles (QoS)")
+            why = f": its writer has another {row.unmatched} (QoS)" if row.unmatched else ""
+            out.append(f"{row.topic}: no message{why}")
     return out
 
 
