@@ -191,8 +191,11 @@ def _ends(path, ends):
     whole[:] = ends
 
 
+IMAGE = "data/image_camera/3.0.0.0"
 ZARR = {
     "cut chunk": lambda d: os.truncate(d / "data/action/0.0", 20),
+    "cut image": lambda d: os.truncate(d / IMAGE, (d / IMAGE).stat().st_size // 2),
+    "no image": lambda d: (d / IMAGE).unlink(),
     "header": lambda d: (d / "data/action/.zarray").write_text("{"),
     "frames": lambda d: _header(d, "data/action", shape=[9, 8]),
     "huge": lambda d: _header(d, "data/action", shape=[12, 10**12]),
@@ -210,6 +213,16 @@ def test_bad_zarr_folders(copy, kind):
     path = copy("zarr")
     ZARR[kind](path)
     assert refused(path, "zarr")
+
+
+def test_black_images_are_written(tmp_path):
+    """Chunks of zeros could be left out, as if they were lost."""
+    image = base.Column((8, 8, 3), "uint8")
+    read = lambda episode, names: {"image": np.zeros((4, 8, 8, 3), np.uint8)}  # noqa: E731
+    made = base.Source(30.0, [4], {"image": image}, read)
+    base.FORMATS.get("zarr").write(tmp_path / "d", made, False)
+    with base.open_dataset(tmp_path / "d", "zarr") as source:
+        assert not source.read(0, ["image"])["image"].any()
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -145,7 +145,7 @@ def test_one_bad_episode_is_left_out(tmp_path, what):
     assert (found.episodes, found.left_out) == (3, 1)
     assert [note.startswith("episode 1:") for note in found.notes] == [True]
     dataset = load.load(tmp_path / "d", residency="host", report=lambda _: None).dataset
-    assert len(dataset.length) == 3
+    assert len(dataset.length) == 3 and found.frames == int(np.sum(dataset.length))
     # A second call finds the same.
     before = kill.tree(tmp_path / "d")
     (tmp_path / "d" / "SEALED.json").unlink()

@@ -17,7 +17,7 @@ from several_formats import BAGS, ROWS, recording
 from strangers import ARM, MAP, bring
 from strangers import source as strangers_source
 
-from starjax.addons.formats import base, clocks, foreign, labels, ranges, timing
+from starjax.addons.formats import base, clocks, file_states, foreign, labels, ranges, timing
 from starjax.addons.formats.base import Column
 from starjax.addons.formats.mapping import ArmColumns, CameraColumn
 from starjax.data import load
@@ -392,6 +392,15 @@ def test_an_import_goes_on_with_the_same_files_only(tmp_path, monkeypatch):
                     foreign.import_mapped(source, made, out, path)
             else:
                 assert foreign.import_mapped(source, made, out, path).episodes == 2
+
+
+def test_a_change_inside_a_table_of_a_megabyte_is_seen(tmp_path):
+    path = tmp_path / "table"
+    path.write_bytes(bytes(1_000_000))
+    before, state = path.stat(), file_states.of(path)
+    path.write_bytes(bytes(500_000) + b"1" + bytes(499_999))
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert file_states.of(path) != state
 
 
 @pytest.mark.parametrize("name", ["elapsed_ms", "t_ns", "time_us", "Time (s)", "t"])

@@ -4,7 +4,7 @@ import hashlib
 from pathlib import Path
 from typing import NamedTuple
 
-_END = 1 << 16  # bytes of a file's beginning and end, where formats have headers and indices
+_END = 1 << 20  # bytes of a file's beginning and end, where formats have headers and indices
 
 
 class FileState(NamedTuple):

@@ -128,6 +128,7 @@ def import_mapped(
     digest = store.write(root, description, episodes_to_write(), size, note)
     count = len(kept) - len(unread)
     left_out = len(source.lengths) - count
+    frames = sum(k.length for k in kept if k.episode not in unread)
     return Imported(
         digest=digest,
         episodes=count,

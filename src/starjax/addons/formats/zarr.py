@@ -5,6 +5,7 @@ meta/episode_ends   [E] int64, first frame after each episode
 """
 
 import contextlib
+import itertools
 import json
 import math
 import zipfile
@@ -63,6 +64,9 @@ def _open(path: Path) -> Iterator[Source]:
             first, last = int(starts[episode]), int(ends[episode])
             for name in names:
                 _require_readable(name, arrays[name], (last - first, *columns[name].shape))
+                if isinstance(storage, Path):  # an archive that lacks a part does not open
+                    folder = storage / "data" / name
+                    _require_chunks(folder, arrays[name], columns[name], range(first, last))
             return {name: np.asarray(arrays[name][first:last]) for name in names}
 
         origin = about.get(base.OURS)
@@ -110,6 +114,7 @@ def _write(path: Path, source: Source, video: bool) -> None:
             chunks=(rows, *column.shape),
             dtype=column.dtype,
             compressors=packed,
+            config={"write_empty_chunks": True},
         )
     buffers = {name: _Buffer(array) for name, array in arrays.items()}
     for episode in range(len(source.lengths)):
@@ -162,6 +167,28 @@ def _require_readable(name: str, array: zarr.Array, shape: Sequence[int]) -> Non
     base.require_fits(f"{name}'s chunks", array.chunks, array.dtype)
     count = math.prod(-(-size // chunk) for size, chunk in zip(shape, array.chunks))
     base.require(count <= _MAX_CHUNKS, f"{_MAX_CHUNKS} chunks of {name} at most", count)
+
+
+def _require_chunks(folder: Path, array: zarr.Array, column: Column, rows: range) -> None:
+    """Raises Damaged for files that rows need and that are cut, or those of images, missing.
+
+    A missing one reads as zeros, which writers may leave out; Blosc reads beyond a cut one.
+    """
+    is_blosc = [type(one).__name__.startswith("Blosc") for one in array.compressors] == [True]
+    if array.shards or not (is_blosc or column.is_image) or not rows:
+        return
+    first, last = rows[0] // array.chunks[0], rows[-1] // array.chunks[0]
+    counts = [-(-size // chunk) for size, chunk in zip(array.shape, array.chunks)]
+    for place in itertools.product(range(first, last + 1), *map(range, counts[1:])):
+        file = folder / array.metadata.encode_chunk_key(place)
+        is_there = file.is_file()
+        base.require(is_there or not column.is_image, f"a file {file}", "none")
+        if is_there and is_blosc:
+            with open(file, "rb") as chunk:
+                size = int.from_bytes(chunk.read(16)[12:], "little")  # last field of the header
+            base.require(
+                file.stat().st_size == size, f"{size} bytes in {file}", file.stat().st_size
+            )
 
 
 def _recognises(path: Path) -> bool:
