@@ -19,20 +19,26 @@ NOISE_STREAM = 1 << 20  # folded into the key: distinct from every attempt's str
 CORRELATION = 0.4  # s, correlation time of the disturbance
 SMOOTHING = 0.15  # s, time constant of its low-pass, for smooth motion
 SLOPE = 0.15  # part of a way's time, at either end, in which its speed changes
+RAMP = 0.1  # s, the longest time of a `slope`
 JAW_TIME = 0.25  # s to close or open
 JAW_DELAY = 2.0 / CONTROL_HZ  # s, for which jaws are waited for at most
 SHUT = 0.0  # opening below which jaws that touch something have it between them
 OPENED = 0.8  # opening from which jaws are clear of an object
 
 
-def sloped(fraction: jax.Array) -> jax.Array:
+def slope(duration: jax.Array) -> jax.Array:
+    """Returns the part of a way's time `[...]` (s) in which its speed changes, `RAMP` at most."""
+    return jnp.minimum(SLOPE, RAMP / duration)
+
+
+def sloped(fraction: jax.Array, slope: jax.Array | float = SLOPE) -> jax.Array:
     """Returns the fraction of the way after a fraction `[...]` of the time, at constant speed.
 
-    Its speed grows and falls evenly during `SLOPE` of the time at either end.
+    Its speed grows and falls evenly during the part `slope` of the time at either end.
     """
     left = jnp.minimum(fraction, 1.0 - fraction)  # symmetric in time
     # Trapezoid of speed: its area up to SLOPE is a parabola, then a line.
-    done = jnp.where(left < SLOPE, left**2 / (2.0 * SLOPE), left - SLOPE / 2.0) / (1.0 - SLOPE)
+    done = jnp.where(left < slope, left**2 / (2.0 * slope), left - slope / 2.0) / (1.0 - slope)
     return jnp.where(fraction < 0.5, done, 1.0 - done)
 
 

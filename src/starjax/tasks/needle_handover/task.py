@@ -150,7 +150,7 @@ TASK = single.TASK._replace(
     time_limit_s=60.0,
     stages=STAGES,
     text=TEXT,
-    expert_version=2,
+    expert_version=3,
     experts={
         "default": "starjax.tasks.needle_handover.expert:AGENT",
         "wrist": "starjax.tasks.needle_handover.expert_wrist:AGENT",

@@ -139,9 +139,7 @@ def _moving(
 ) -> handover.HandoverScript:
     """Returns the script at the time at which its phase has the tools' speed."""
     way = script.goal - script.p
-    aligned, turned = (
-        jnp.asarray(rows, jnp.float32)[script.phase] for rows in (play.aligned, play.turned)
-    )
+    aligned, _ = handover.shares(play, script.phase)
     along = jnp.where(aligned < 1.0, way * jnp.array([0.0, 0.0, 1.0]), way)
     left = jnp.linalg.norm(along, axis=-1)
     # The tool with the longer way decides.
@@ -150,9 +148,9 @@ def _moving(
     is_still = left[arm] < midway.ARRIVED
     is_still |= jnp.asarray(scripting.is_of_jaws(play.jaws))[script.phase]
     speed = jnp.maximum(state.velocity[arm, :3] @ along[arm] / most, 0.0)
-    at = midway.share(most, speed, script.duration)
-    aside, roll = (scripting.sloped(jnp.minimum(at / x, 1.0)) for x in (aligned, turned))
-    done = jnp.stack([aside, aside, scripting.sloped(at)])
+    at = midway.share(most, speed, script.duration, scripting.slope(script.duration))
+    aside, roll, fraction = handover.progress(play, script, at)
+    done = jnp.stack([aside, aside, fraction])
     start = script.goal - way / jnp.maximum(1.0 - done, jnp.array([midway.LEFT, midway.LEFT, 1e-6]))
     roll_from = script.roll_to - (script.roll_to - script.roll) / jnp.maximum(
         1.0 - roll, midway.LEFT

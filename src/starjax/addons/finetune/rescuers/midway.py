@@ -21,25 +21,30 @@ LONGEST = 0.1  # m, of a whole way: the longest between pegs
 _SHARE = np.linspace(0.0, 0.95, 96)
 
 
-def _pace(share: jax.Array) -> jax.Array:
+def _pace(share: jax.Array, slope: jax.Array | float) -> jax.Array:
     """Returns the speed of `scripting.sloped` as a multiple of the way that is left."""
-    slope = scripting.SLOPE
     speed = jnp.minimum(jnp.minimum(share, 1.0 - share) / slope, 1.0) / (1.0 - slope)
-    return speed / (1.0 - scripting.sloped(share))
+    return speed / (1.0 - scripting.sloped(share, slope))
 
 
-def share(left: jax.Array, speed: jax.Array, duration: jax.Array) -> jax.Array:
+def share(
+    left: jax.Array,
+    speed: jax.Array,
+    duration: jax.Array,
+    slope: jax.Array | float = scripting.SLOPE,
+) -> jax.Array:
     """Returns the fraction of its time at which a smooth motion has this much left at this speed.
 
     Args:
       left: m.
       speed: m/s, towards the goal.
       duration: s, of the whole motion.
+      slope: as in `scripting.sloped`.
     """
     shares = jnp.asarray(_SHARE)
-    share = jnp.interp(speed * duration / left, _pace(shares), shares)
+    share = jnp.interp(speed * duration / left, _pace(shares, slope), shares)
     # A tool that is too fast to stop in time is at the end of the longest way.
-    most = jnp.interp(1.0 - left / LONGEST, scripting.sloped(shares), shares)
+    most = jnp.interp(1.0 - left / LONGEST, scripting.sloped(shares, slope), shares)
     return jnp.minimum(share, most)
 
 
