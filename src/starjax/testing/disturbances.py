@@ -82,6 +82,7 @@ def _levels(kind: Disturbance) -> Iterator[str]:
 
 
 def _images(kind: Disturbance) -> Iterator[str]:
+    assert kind.on_image is not None
     image = jax.random.randint(jax.random.key(0), (SIDE, SIDE, 3), 0, 256, jnp.uint8)
     for level in (0.0, kind.levels[-1]):
         state = disturbances.DisturbanceState(jnp.float32(level), jax.random.key(1))
