@@ -1,15 +1,20 @@
 """Time of one policy call (Table IV): encoder, DDIM, roll network; and the roll network's share.
 
     python benchmarks/bench_inference.py [--only "224 px"] [--peer [PYTHON]] [--tiny]
+    python benchmarks/bench_inference.py --packaged
 
 On a GPU: the paper's model from pictures, at batch 1 and 360, against PyTorch and the floor: the
 larger of its arithmetic and of its weights in the networks' type, the U-Net's read once for each of
 its evaluations, FiLM's and the encoder's once a call. On a CPU: a small model of the task's state,
 for every count of DDIM steps, against numpy with the matrix products of the same call
-on the same cores.
+on the same cores. `--packaged`: size of each packaged policy, time of its
+decision, memory of a process.
 """
 
 import argparse
+import json
+import subprocess
+import sys
 
 import _arithmetic
 import _machine
@@ -25,7 +30,7 @@ from starjax.addons.decisions import parallel_ddim
 from starjax.cli import bench
 from starjax.core import config
 from starjax.evaluation import latency
-from starjax.policies import features
+from starjax.policies import features, packaged
 from starjax.policies import policy as policies
 from starjax.policies.models import roll_net
 
@@ -53,9 +58,13 @@ def main() -> None:
     parser.add_argument("--only", default="", help="rows whose name contains this")
     parser.add_argument("--seconds", type=float, default=2.0, help="of timed calls a row")
     parser.add_argument("--tiny", action="store_true", help="a test's sizes, nothing is written")
+    parser.add_argument("--packaged", action="store_true", help="packaged policies, see above")
     _peer.add_flag(parser)
     asked = parser.parse_args()
     runtime.prepare_xla()
+    if asked.packaged:
+        rows = {name: packaged_size(name) for name in packaged.names()}
+        return _timing.report("packaged", rows, asked.tiny)
     cases = CASES["tiny" if asked.tiny else _peer.platform()]
     cases = {name: case for name, case in cases.items() if asked.only in name}
     # Before jax takes the device's memory.
@@ -144,6 +153,31 @@ def weights_read(params: policies.Params, policy_config, evaluations: int) -> fl
         again = "'unet'" in name and "film_" not in name and "'time_" not in name
         total += leaf.size * (evaluations if again else 1)
     return total * jnp.dtype(policy_config.dtype).itemsize
+
+
+def packaged_size(name: str) -> dict[str, float]:
+    """MB of a policy's file, ms of a decision, and peak MB of the process that makes them."""
+    program = """
+import json, resource, sys, time
+import numpy as np
+from starjax import deploy
+from starjax.deploy import batching
+batches = batching.Batches(deploy.load(sys.argv[1]), 1)
+batches.warm_up()
+times = []
+for _ in range(100):
+    begun = time.perf_counter()
+    batches.infer([batching.example(batches.policy.input_spec)])
+    times.append(1e3 * (time.perf_counter() - begun))
+peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+print(json.dumps({"decision_ms": float(np.median(times)), "memory_mb": peak}))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program, name], capture_output=True, text=True, check=True
+    )
+    row = {"mb": packaged.locate(name).stat().st_size / 1e6, **json.loads(done.stdout)}
+    print(name, row, flush=True)
+    return row
 
 
 def numpy_ms(policy: policies.Policy, *traced) -> float:
