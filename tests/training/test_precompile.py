@@ -96,4 +96,4 @@ def test_steps_in_a_loop_are_ready_before_the_data_are_known(tmp_path, monkeypat
     monkeypatch.setattr(fakes, "dataset", padded)
     found = jobs.train(tmp_path / "ahead", step_program=program).state
     for one, other in zip(jax.tree.leaves(found.params), jax.tree.leaves(usual.params)):
-        np.testing.assert_array_equal(one, other)
+        np.testing.assert_allclose(one, other, rtol=1e-6)  # programs of two sizes may round apart
