@@ -147,22 +147,16 @@ def _act(
     return rough, script, play.command(script.roll, script.p, script.jaws, state)
 
 
-def shares(play: Play, phase: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Returns the shares of a phase's time after which a tool is above its goal, and has turned."""
-    return jnp.asarray(play.aligned, jnp.float32)[phase], jnp.asarray(play.turned, jnp.float32)[
-        phase
-    ]
-
-
 def progress(play: Play, script: HandoverScript, s: jax.Array) -> tuple[jax.Array, ...]:
     """Returns the fractions of the way in x and y, of the turn, and of the way in z, at share `s`.
 
     A policy that executes few commands of a plan does not begin a way whose first commands hardly
     move: with slopes of 0.36 s it stayed for seconds where lift and carry meet.
     """
+    ends = [jnp.asarray(at, jnp.float32)[script.phase] for at in (play.aligned, play.turned)]
     return tuple(
         scripting.sloped(jnp.minimum(s / at, 1.0), scripting.slope(at * script.duration))
-        for at in (*shares(play, script.phase), 1.0)
+        for at in (*ends, 1.0)
     )
 
 

@@ -139,7 +139,7 @@ def _moving(
 ) -> handover.HandoverScript:
     """Returns the script at the time at which its phase has the tools' speed."""
     way = script.goal - script.p
-    aligned, _ = handover.shares(play, script.phase)
+    aligned = jnp.asarray(play.aligned, jnp.float32)[script.phase]
     along = jnp.where(aligned < 1.0, way * jnp.array([0.0, 0.0, 1.0]), way)
     left = jnp.linalg.norm(along, axis=-1)
     # The tool with the longer way decides.
