@@ -128,6 +128,13 @@ def test_round_trip(tmp_path):
     jax.tree.map(np.testing.assert_array_equal, found.normalizer, trained().normalizer)
 
 
+def test_the_turn_of_older_files_is_left_out(tmp_path):
+    before = trained()
+    policy_file.save(tmp_path / "p", before._replace(params={**before.params, "turn": {"b": 1.0}}))
+    after = policy_file.load(tmp_path / "p")
+    assert policy_file.fingerprint(after.params) == policy_file.fingerprint(before.params)
+
+
 def test_the_packaged_policy_is_whole():
     found = policy_file.load(packaged.find("policy", "compact"))
     assert (found.scene, found.policy.crop_fraction) == (fakes.SCENE, 0.9)

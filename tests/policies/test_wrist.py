@@ -13,7 +13,7 @@ from starjax.core import config, errors
 from starjax.core.methods import METHODS
 from starjax.core.types import Pose
 from starjax.data import normalizer, windows
-from starjax.policies import execution, features, pose_hierarchy
+from starjax.policies import execution, features
 from starjax.policies import policy as policies
 
 WRIST = rcm.LARGE_NEEDLE_DRIVER
@@ -119,33 +119,6 @@ def test_controls_differ_in_the_trocar_alone():
         assert told.sees_trocar and not row.sees_trocar
         same = {"sees_trocar": False, "weights_of": "", "label": ""}
         assert told._replace(**same) == row._replace(**same)
-
-
-def test_the_heir_by_pose_keeps_the_generated_pose_but_for_a_turn_about_x():
-    policy, stats, params, batch = made("stardiff_pose")
-    still = {**params, "turn": jax.tree.map(jnp.zeros_like, params["turn"])}
-    keys, sample = jax.random.split(jax.random.key(1), 3), jit(policy.sample)
-    here, there = (sample(x, stats, keys, batch.observation, batch.trocar) for x in (params, still))
-    feasible = rcm.through(WRIST, there.pose, batch.trocar.p_world_trocar[:, None]).is_feasible
-    assert np.asarray(feasible).any()
-    np.testing.assert_allclose(here.pose.p, there.pose.p, atol=2e-6)
-    turn = np.abs(np.arccos(np.clip(np.sum(here.pose.R * there.pose.R, (-2, -1)) / 2 - 0.5, -1, 1)))
-    assert turn.max() > 1e-3
-
-
-def test_turns_are_about_the_own_x_axis_and_the_network_learns_the_missing_one():
-    R = rcm.rotation_from_axis_roll(jnp.array([0.3, -0.2, -1.0]), jnp.array(0.7))
-    rot6d = rcm.rot6d_encode(R)
-    turned = rcm.rot6d_decode(pose_hierarchy.turned(rot6d, jnp.array(0.4)))
-    cos, sin = np.cos(0.4), np.sin(0.4)
-    about_x = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
-    np.testing.assert_allclose(turned, R @ about_x, atol=1e-6)
-
-    policy, stats, _, batch = made("stardiff_pose")
-    given = jit(policy.prepare)(stats, jax.random.key(0), batch).lesson
-    angle = pose_hierarchy.TURN * jnp.broadcast_to(given.target[..., 0], given.path.shape[:-1])
-    again = pose_hierarchy.turned(given.path[..., 3:], angle)
-    np.testing.assert_allclose(rcm.rot6d_decode(again), batch.command.pose.R, atol=1e-5)
 
 
 def test_the_free_shaft_is_measured_and_not_that_of_the_trocar():

@@ -17,8 +17,8 @@ class Method(NamedTuple):
       action_space: key of `starjax.rcm.ACTION_SPACES`.
       sees_trocar: the learner's model is conditioned on the trocar; the roll network always is.
       projects: poses are projected onto the RCM manifold at execution.
-      hierarchical: the learner for (position, gripper), or (pose, gripper), and a network for the
-        rest, such as the roll; else one model.
+      hierarchical: the learner for (position, gripper), and a network for the rest, such as the
+        roll; else one model.
       weights_of: the method whose weights it shares; empty for its own.
       label: name in tables; empty for its name.
       group: group in Tables II and III; further rows have another.
@@ -59,20 +59,16 @@ _BUILT_IN: dict[str, Method] = {
         "se3_wrist", projects=True, weights_of="dp_ee_wrist", label="DP-EE-Proj-Wrist", group=_WRIST
     ),
     "dp_rcm6": Method("rcm6", sees_trocar=True, label="DP-RCM-6", group=_WRIST),
-    # Two heirs of STAR-Diff. By position: the network gives roll and wrist. By pose: the wrist
-    # follows exactly, and the network only turns the jaws about their own axis of yaw.
+    # Two heirs of STAR-Diff. By position: the network gives roll and wrist. By pose: both follow
+    # exactly from the pose and the trocar.
     "stardiff_wrist": Method("rcm6", hierarchical=True, label="STAR-Diff-Wrist", group=_WRIST),
-    "stardiff_pose": Method("se3_through", hierarchical=True, label="STAR-Diff-Pose", group=_WRIST),
+    "stardiff_pose": Method("se3_through", label="STAR-Diff-Pose", group=_WRIST),
     # Controls: generators with the trocar as input, and one model without it.
     "stardiff_wrist_told": Method(
         "rcm6", sees_trocar=True, hierarchical=True, label="STAR-Diff-Wrist-Told", group=_WRIST
     ),
     "stardiff_pose_told": Method(
-        "se3_through",
-        sees_trocar=True,
-        hierarchical=True,
-        label="STAR-Diff-Pose-Told",
-        group=_WRIST,
+        "se3_through", sees_trocar=True, label="STAR-Diff-Pose-Told", group=_WRIST
     ),
     "dp_rcm6_untold": Method("rcm6", label="DP-RCM-6-Untold", group=_WRIST),
 }

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from starjax import rcm
 from starjax.core import config, methods
-from starjax.policies import features, hierarchical, pose_hierarchy, single
+from starjax.policies import features, hierarchical, single
 from starjax.policies.base import Params, Policy
 from starjax.sim.task import Task
 
@@ -38,9 +38,6 @@ def make(
       cameras: observed cameras in the networks' order; by default the task's first one.
     """
     method = ablated(method, policy_config)
-    build = single.make
-    if method.hierarchical:
-        turns = rcm.ACTION_SPACES.registry.get(method.action_space).turns
-        build = pose_hierarchy.make if turns == ("R",) else hierarchical.make
+    build = hierarchical.make if method.hierarchical else single.make
     sensors = features.select_sensors(task, cameras)
     return build(method, policy_config, sensors, train_config or config.TrainConfig())

@@ -28,6 +28,7 @@ _KEY = "starjax"  # one metadata entry: the format does not keep the order of se
 _SEPARATOR = "/"
 _MONITOR = "monitor"  # prefix of its arrays, and key of its other values
 _MONITOR_ARRAYS = ("center", "width")
+_RETIRED = "turn"  # network in older files of `stardiff_pose`; poses succeed more often without it
 
 
 class Trained(NamedTuple):
@@ -225,12 +226,13 @@ def _monitor(about: dict[str, Any], arrays: dict[str, np.ndarray]) -> record.Mon
 def _trained(about: dict[str, Any], tree: dict[str, Any]) -> Trained:
     """Parses the content of a file; raises KeyError, TypeError or ValueError if it is malformed."""
     stats = {name: normalizer.MinMax(**part) for name, part in tree["normalizer"].items()}
+    params = {name: part for name, part in tree["params"].items() if name != _RETIRED}
     places, demos, scene = about["p_world_ref"], about.get("demos"), about["scene"]
     return Trained(
         method=about["method"],
         policy=config_json.from_dict(config.PolicyConfig, about["policy"]),
         train=config_json.from_dict(config.TrainConfig, about["train"]),
-        params=tree["params"],
+        params=params,
         normalizer=normalizer.Normalizer(action=stats["action"], state=stats.get("state")),
         scene=names.SceneNames(
             scene["task"], *(tuple(scene[part]) for part in ("arms", "tools", "cameras"))

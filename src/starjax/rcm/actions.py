@@ -50,9 +50,8 @@ class ActionSpace(NamedTuple):
       slices: positions of the parts "p" m, "R" 6-D, "depth" m, "roll" rad, "wrist" `[2]` rad.
       is_absolute: positions are in the world frame, the same at every trocar.
       is_free: the shaft of a decoded pose need not pass the trocar.
-      turns: parts that the small network of a hierarchical policy predicts: all before "p", the
-        last part; or "R" alone, of which it corrects the turn about the tip's x axis. Empty if the
-        space has no such policy.
+      turns: parts that the roll network of a hierarchical policy predicts: all before "p", the last
+        part. Empty if the space has no such policy.
       for_wrist: wrist -> this space for instruments with that wrist; None for straight ones. If it
         `is_free`, its part "wrist" is what is commanded.
     """

@@ -73,7 +73,7 @@ def se3_through(wrist: wrists.Wrist) -> actions.ActionSpace:
     def decode(parts: dict[str, jax.Array], frame: actions.SpaceFrame) -> Pose:
         return wrists.through(wrist, _free_pose(parts), frame.p).pose
 
-    facts = {"is_absolute": True, "turns": ("R",), "for_wrist": se3_through}
+    facts = {"is_absolute": True, "for_wrist": se3_through}
     return actions.make_space("se3_through", encode, decode, **facts, p=3, R=6)
 
 

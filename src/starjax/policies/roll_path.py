@@ -1,4 +1,4 @@
-"""The small network of a hierarchy: one for all arms, given each arm's path and trocar."""
+"""The roll network along a path: one for all arms, given each arm's path and trocar."""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,18 +16,19 @@ def make(
     policy_config: config.PolicyConfig,
     arms: int,
     observed: int,
-    path: int = 3,
-    history: int = 1,
-    outputs: int = 1,
+    outputs: int,
 ) -> tuple[Callable[[jax.Array], Any], Callable[..., jax.Array]]:
-    """Builds `init` and `along` of a `hierarchy.SmallNetwork`.
+    """Builds the network's `init` and `along` (Eq. 13, and inputs of ablations).
 
     Args:
       policy_config: its width and blocks, and the ablations of its inputs.
       arms: A.
       observed: size of `sequences.observation_vector`.
-      path, history: n and m, numbers per arm and moment.
-      outputs: N.
+      outputs: N, turns of an arm.
+
+    Returns:
+      key -> parameters, and (parameters, path `[B, H, A, 3]`, trocar features `[B, A, 7]`, history
+      `[B, O, A, N]`, Condition) -> `[B, H, A, N]`.
     """
     network = roll_net.RollNet(
         width=policy_config.roll_width,
@@ -40,9 +41,9 @@ def make(
     predict = kernels.applied(network)
 
     def init(key: jax.Array) -> Any:
-        p = jnp.zeros((1, policy_config.horizon, path))
+        p = jnp.zeros((1, policy_config.horizon, 3))
         trocar = jnp.zeros((1, features.TROCAR_FEATURES))
-        past = jnp.zeros((1, policy_config.obs_horizon * history))
+        past = jnp.zeros((1, policy_config.obs_horizon * outputs))
         more = jnp.zeros((1, observed)) if policy_config.roll_observation else None
         return network.init(key, p, trocar, past, more)
 
@@ -57,7 +58,7 @@ def make(
         more = None
         if policy_config.roll_observation:
             more = jnp.repeat(sequences.observation_vector(condition), arms, axis=0)  # [B * A, C]
-        found = predict(
+        turns = predict(
             params,
             # Arms become rows of the batch: one f_phi serves all of them.
             path.swapaxes(1, 2).reshape(batch * arms, horizon, -1),
@@ -65,6 +66,6 @@ def make(
             history_weight * history.swapaxes(1, 2).reshape(batch * arms, -1),
             more,
         )
-        return found.reshape(batch, arms, horizon, outputs).swapaxes(1, 2)  # [B, H, A, N]
+        return turns.reshape(batch, arms, horizon, outputs).swapaxes(1, 2)  # [B, H, A, N]
 
     return init, along
