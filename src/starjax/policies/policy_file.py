@@ -148,7 +148,7 @@ def load(path: pathlib.Path | str) -> Trained:
         raise ValueError(f"{path}: made by another version of starjax: {why}") from error
     trained = trained._replace(monitor=monitor)
     _check_monitor(trained, monitor_path(path) if separate else path)
-    return trained
+    return _without_retired(trained)
 
 
 def is_policy(path: pathlib.Path | str) -> bool:
@@ -226,13 +226,12 @@ def _monitor(about: dict[str, Any], arrays: dict[str, np.ndarray]) -> record.Mon
 def _trained(about: dict[str, Any], tree: dict[str, Any]) -> Trained:
     """Parses the content of a file; raises KeyError, TypeError or ValueError if it is malformed."""
     stats = {name: normalizer.MinMax(**part) for name, part in tree["normalizer"].items()}
-    params = {name: part for name, part in tree["params"].items() if name != _RETIRED}
     places, demos, scene = about["p_world_ref"], about.get("demos"), about["scene"]
     return Trained(
         method=about["method"],
         policy=config_json.from_dict(config.PolicyConfig, about["policy"]),
         train=config_json.from_dict(config.TrainConfig, about["train"]),
-        params=params,
+        params=tree["params"],
         normalizer=normalizer.Normalizer(action=stats["action"], state=stats.get("state")),
         scene=names.SceneNames(
             scene["task"], *(tuple(scene[part]) for part in ("arms", "tools", "cameras"))
@@ -243,6 +242,15 @@ def _trained(about: dict[str, Any], tree: dict[str, Any]) -> Trained:
         preset=about.get("preset"),
         packages=about.get("packages", {}),
     )
+
+
+def _without_retired(trained: Trained) -> Trained:
+    """Leaves the retired network out. A monitor stays: its scores are of positions alone."""
+    if _RETIRED not in trained.params:
+        return trained
+    params = {name: part for name, part in trained.params.items() if name != _RETIRED}
+    monitor = trained.monitor and trained.monitor._replace(digest=monitor_digest(params))
+    return trained._replace(params=params, monitor=monitor)
 
 
 def _floats(values: Any) -> Any:
