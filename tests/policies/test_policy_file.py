@@ -129,13 +129,15 @@ def test_round_trip(tmp_path):
 
 
 def test_the_turn_of_older_files_is_left_out(tmp_path):
-    before = trained()
+    before = trained()._replace(method="stardiff_pose")
     old = before._replace(params={**before.params, "turn": {"b": 1.0}})
     policy_file.save(tmp_path / "p", with_monitor(old))
     after = policy_file.load(tmp_path / "p")
     assert policy_file.fingerprint(after.params) == policy_file.fingerprint(before.params)
     assert after.monitor.digest == policy_file.monitor_digest(before.params)
     policy_file.save(tmp_path / "again", after)  # refuses a monitor of other weights
+    policy_file.save(tmp_path / "other", old._replace(method="theirs"))  # a network of that name
+    assert "turn" in policy_file.load(tmp_path / "other").params
 
 
 def test_the_packaged_policy_is_whole():

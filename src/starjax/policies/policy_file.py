@@ -28,7 +28,8 @@ _KEY = "starjax"  # one metadata entry: the format does not keep the order of se
 _SEPARATOR = "/"
 _MONITOR = "monitor"  # prefix of its arrays, and key of its other values
 _MONITOR_ARRAYS = ("center", "width")
-_RETIRED = "turn"  # network in older files of `stardiff_pose`; poses succeed more often without it
+# Networks in older files, by method: poses succeed more often without them.
+_RETIRED = {"stardiff_pose": "turn", "stardiff_pose_told": "turn"}
 
 
 class Trained(NamedTuple):
@@ -142,11 +143,10 @@ def load(path: pathlib.Path | str) -> Trained:
     separate = _separate_monitor(path)
     try:
         trained = _trained(about, _unflatten(arrays))
-        monitor = separate or _monitor(about, arrays)
+        trained = trained._replace(monitor=separate or _monitor(about, arrays))
     except (KeyError, TypeError, ValueError) as error:
         why = f"no {error} in it" if isinstance(error, KeyError) else error
         raise ValueError(f"{path}: made by another version of starjax: {why}") from error
-    trained = trained._replace(monitor=monitor)
     _check_monitor(trained, monitor_path(path) if separate else path)
     return _without_retired(trained)
 
@@ -246,9 +246,9 @@ def _trained(about: dict[str, Any], tree: dict[str, Any]) -> Trained:
 
 def _without_retired(trained: Trained) -> Trained:
     """Leaves the retired network out. A monitor stays: its scores are of positions alone."""
-    if _RETIRED not in trained.params:
+    if (retired := _RETIRED.get(trained.method)) not in trained.params:
         return trained
-    params = {name: part for name, part in trained.params.items() if name != _RETIRED}
+    params = {name: part for name, part in trained.params.items() if name != retired}
     monitor = trained.monitor and trained.monitor._replace(digest=monitor_digest(params))
     return trained._replace(params=params, monitor=monitor)
 
