@@ -162,7 +162,7 @@ def act(script: ThrowScript, state: EnvState) -> tuple[Command, ThrowScript, Com
     """Returns the disturbed command, the script a step later, and the command to record."""
     after = enter(script, _following(script, state), state)
     script, s = phases.advance(script, TIMING, after, state)
-    share = scripting.sloped(s, scripting.slope(script.duration))
+    share = scripting.sloped(s)
     is_arc = (script.phase == DRIVE) | (script.phase == OUT)
     on_arc, straight = _on_arc(script, share, state), wrist_script.straight(script, share)
     tip = jax.tree.map(lambda a, b: jnp.where(is_arc, a, b), on_arc, straight)
