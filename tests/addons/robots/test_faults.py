@@ -71,6 +71,25 @@ def test_a_robot_that_is_killed_and_back_elsewhere_is_not_pulled(own_bus, tmp_pa
     assert told["commands"] > 50 and told["moved"] < 0.01
 
 
+def test_a_run_begins_with_messages_of_its_own(own_bus, tmp_path, monkeypatch):
+    """Another robot is in the place of the first, and its first messages come late."""
+    with robot() as first, made(own_bus, file_of(tmp_path)) as (one, client, _):
+        first.kill()
+        take, asked = own_bus._take, []
+
+        def late(topic):
+            if topic != "/clock":
+                asked.append(time.monotonic())
+            return bool(asked) and time.monotonic() > asked[0] + 0.3 and take(topic)
+
+        with robot(0.25) as second:
+            monkeypatch.setattr(bus, "_PATIENCE_S", 60.0)  # the kept messages do not become old
+            monkeypatch.setattr(own_bus, "_take", late)
+            node.run(one, client, 1.0)
+            told = second.end()
+    assert told["moved"] < 0.01, told
+
+
 @pytest.mark.slow
 def test_a_killed_node_leaves_an_arm_that_holds_and_a_second_begins(own_bus, tmp_path):
     file = file_of(tmp_path)

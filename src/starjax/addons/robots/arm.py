@@ -7,6 +7,7 @@ A patient side manipulator measures its pose itself; that of other arms follows 
 # Sequences of messages are lists: see `messages`.
 
 import io
+import time
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,6 +25,8 @@ WORLD = "world"  # frame of the policy's world in headers
 _IDENTITY = crtk.pose_of_arrays(np.eye(3), np.zeros(3))
 _ENCODINGS = {"rgb8": False, "bgr8": True}  # True: blue first
 _REPORTS = ("warning", "error")
+_MEASURED = ("pose", "joints", "jaw")
+REFRESH_S = 3.0  # s, the longest wait for new measurements; then they are stale
 MAX_JOINT_STEP = 0.2  # rad and m between two commands: more is another branch of the kinematics
 
 
@@ -108,6 +111,14 @@ class CrtkArm:
         """Reads all topics at once, as of one moment; returns those with a new message."""
         return self.bus.poll()
 
+    def refresh(self) -> None:
+        """Waits for new measurements: kept ones may be of a robot that is no longer there."""
+        awaited = {self.sources[name].topic for name in _MEASURED if name in self.sources}
+        end = time.monotonic() + REFRESH_S
+        while awaited and time.monotonic() < end:
+            awaited -= set(self.poll())
+            time.sleep(5e-4)
+
     def missing(self) -> list[str]:
         """Returns the sources without a message."""
         return [name for name, one in self.sources.items() if one.topic not in self.bus.newest]
@@ -147,8 +158,7 @@ class CrtkArm:
         if missing := self.missing():
             raise UsageError("robot", "a message of each topic", f"none of {', '.join(missing)}")
         now = self.bus.now() if now is None else now
-        measured = [name for name in ("pose", "joints", "jaw") if name in self.sources]
-        ages = [self.age(name, now) for name in measured]
+        ages = [self.age(name, now) for name in _MEASURED if name in self.sources]
         cameras = [name for name in self.sources if name.startswith("camera ")]
         shown = {name.removeprefix("camera "): self._image(name) for name in cameras}
         base, q = self.file.pose_world_base, self._joints()

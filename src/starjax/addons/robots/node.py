@@ -77,6 +77,7 @@ def run(
     still = Command(seen.pose, seen.gripper)
     way(still, still, client.p_world_trocar)  # compiles, as does an error
     rcm.rcm_error(seen.shaft, client.p_world_trocar)
+    arm.refresh()
     period, due, last = 1.0 / arm.file.arm.rate, arm.bus.now(), None
     for _ in range(round(seconds * client.control_hz)):
         arm.poll()
@@ -109,7 +110,7 @@ def run(
             if should_stop() or not confirm(reason):
                 break
             arm.forget()
-            arm.poll()
+            arm.refresh()
             client.restart(arm.measure())
             due = arm.bus.now()
         elif should_stop():
