@@ -5,6 +5,7 @@ import pathlib
 import subprocess
 import sys
 import time
+import types
 
 import mistakes
 import numpy as np
@@ -51,10 +52,13 @@ def test_a_doubt_silences_the_node(own_bus, tmp_path, line, name):
     assert told["commands"] <= sent and told["moved"] < 0.005 and told["holds"] == 1
 
 
-def test_a_robot_that_is_killed_and_back_elsewhere_is_not_pulled(own_bus, tmp_path):
+def test_a_robot_that_is_killed_and_back_elsewhere_is_not_pulled(own_bus, tmp_path, monkeypatch):
     with robot() as first, made(own_bus, file_of(tmp_path)) as (one, client, _):
+        order, refresh = [], one.refresh
+        monkeypatch.setattr(one, "refresh", lambda: (order.append(one.sent), refresh()))
         stop = iter([False] * 20 + [True])
         node.run(one, client, 5.0, should_stop=lambda: next(stop))
+        assert order == [0]  # before the first command
         first.kill()
         with robot(0.25) as second:
             report = node.run(one, client, 5.0)  # until the first doubt: no person confirms
@@ -71,23 +75,12 @@ def test_a_robot_that_is_killed_and_back_elsewhere_is_not_pulled(own_bus, tmp_pa
     assert told["commands"] > 50 and told["moved"] < 0.01
 
 
-def test_a_run_begins_with_messages_of_its_own(own_bus, tmp_path, monkeypatch):
-    """Another robot is in the place of the first, and its first messages come late."""
-    with robot() as first, made(own_bus, file_of(tmp_path)) as (one, client, _):
-        first.kill()
-        take, asked = own_bus._take, []
-
-        def late(topic):
-            if topic != "/clock":
-                asked.append(time.monotonic())
-            return bool(asked) and time.monotonic() > asked[0] + 0.3 and take(topic)
-
-        with robot(0.25) as second:
-            monkeypatch.setattr(bus, "_PATIENCE_S", 60.0)  # the kept messages do not become old
-            monkeypatch.setattr(own_bus, "_take", late)
-            node.run(one, client, 1.0)
-            told = second.end()
-    assert told["moved"] < 0.01, told
+def test_measurements_are_awaited_anew():
+    """A robot came back elsewhere, and the kept measurements are of the one before."""
+    polls = iter([["/jaw"], ["/pose"], [], ["/pose"], ["/joints"], ["/later"]])
+    sources = {name: arm.TopicSource(f"/{name}", None) for name in ("pose", "joints", "jaw")}
+    arm.CrtkArm.refresh(types.SimpleNamespace(sources=sources, poll=lambda: next(polls)))
+    assert next(polls) == ["/later"]
 
 
 @pytest.mark.slow

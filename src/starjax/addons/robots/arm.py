@@ -112,7 +112,7 @@ class CrtkArm:
         return self.bus.poll()
 
     def refresh(self) -> None:
-        """Waits for new measurements: kept ones may be of a robot that is no longer there."""
+        """Waits for new measurements: kept ones may be older than the robot."""
         awaited = {self.sources[name].topic for name in _MEASURED if name in self.sources}
         end = time.monotonic() + REFRESH_S
         while awaited and time.monotonic() < end:
