@@ -11,7 +11,7 @@ from starjax.core import config, config_json, errors, limits, methods
 from starjax.core.learners import LEARNERS
 from starjax.policies import policy as policies
 from starjax.policies import policy_file
-from starjax.sim import registries
+from starjax.sim import registries, wrists
 
 
 def changed(settings: config.PolicyConfig, options: Mapping[str, Any]) -> config.PolicyConfig:
@@ -38,7 +38,8 @@ def applied(
     if not options:
         return trained
     new = changed(trained.policy, options)
-    row, task = methods.METHODS[trained.method], registries.tasks.get(trained.scene.task)
+    row = methods.METHODS[trained.method]
+    task = wrists.holding(registries.tasks.get(trained.scene.task), trained.scene)
 
     def shapes(settings: config.PolicyConfig) -> Any:
         made = policies.make(row, settings, task, cameras=trained.scene.cameras)
