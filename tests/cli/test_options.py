@@ -158,6 +158,12 @@ def test_a_presets_expert_is_for_its_own_task():
     assert settings("--preset cpu --task reach --demos.expert slow").demos.expert == "slow"
 
 
+def test_plans_for_a_moving_target_are_shorter_unless_typed():
+    assert settings("--task endoscope_track").policy.execute == 2
+    assert settings("--task endoscope_track --policy.execute 4").policy.execute == 4
+    assert settings("--task reach").policy.execute == settings("").policy.execute
+
+
 @pytest.mark.parametrize(
     "typed", ["x/stardiff --trocars 3", "--trocars 3 x/stardiff", "--trocars=3 x/stardiff"]
 )

@@ -89,8 +89,11 @@ def _default(argv: Sequence[str], preset: str) -> config_lib.RunConfig:
         policy = config_lib.with_learner(policy, learner)
     if options.typed_value("policy.observation", argv) == "state":
         policy = dataclasses.replace(policy, encoder_weights="", freeze_encoder=False)
-    if options.typed_value("scene.task", argv) not in (None, default.scene.task):
+    task = options.typed_value("scene.task", argv)
+    if task not in (None, default.scene.task):
         demos = dataclasses.replace(demos, expert="")
+    if task in presets.EXECUTE:
+        policy = dataclasses.replace(policy, execute=presets.EXECUTE[task])
     return dataclasses.replace(default, policy=policy, demos=demos)
 
 
