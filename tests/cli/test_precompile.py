@@ -124,8 +124,9 @@ def test_features_and_steps_are_compiled_before_the_demonstrations_exist(tmp_pat
     cameras = {"cameras": env.names.cameras, "step_program": step}
     given = METHODS["stardiff"], policy, settings.train, dataset, env.task, tmp_path / "stardiff", 0
     assert int(loop.run(*given, **cameras).state.step) == 2
-    # Those of collecting, for which `DemosWork.precompile` was not called, and of the first state.
-    assert set(compiled) == {"start", "advance", "init", "create"}
+    # Those of collecting, for which `DemosWork.precompile` was not called, of the first state, and
+    # of a log line's learning rate.
+    assert set(compiled) == {"start", "advance", "init", "create", "schedule"}
 
 
 def larger(look: Any) -> Any:
