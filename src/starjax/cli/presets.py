@@ -143,7 +143,7 @@ PRESETS = Rows(
     Registry("preset", _BUILT_IN, "starjax.core.config:RunConfig"),
     lambda name, row: dataclasses.replace(row, preset=name),
 )
-# Commands of a plan in tasks whose target moves by itself: with the eight of other tasks, endoscope
+# Executed commands per plan of tasks whose target moves: with the eight of other tasks, endoscope
 # tracking fails in 599 of 600 trials (experiments/trocar_benchmark).
 EXECUTE = {"endoscope_track": 2}
 
