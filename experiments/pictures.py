@@ -84,7 +84,11 @@ def scores_of(page: claims.Study) -> Scores:
         return levels(picture["levels"], picture["labels"])
     if "bar" in picture:
         return rates(tables.table(picture["bar"]))
-    return rates(tables.table(f"{page.folder.name}/{picture['of']}")) if "of" in picture else {}
+    if "of" not in picture:
+        return {}
+    folder, name = (page.folder / picture["of"]).parent, Path(picture["of"]).name
+    study = claims.load(folder)
+    return rates(claims.table(study, name, study.spec.get("shown")))
 
 
 def digest(scores: Scores) -> str:
@@ -143,6 +147,7 @@ def _intervals(scores: Scores, muted: str) -> Any:
     low = min(score.low for row in scores.values() for score in row.values())
     axis.set_xlim(max(0.0, low - 0.03), 1.01)
     axis.axvline(0.95, color=muted, linewidth=0.8, linestyle=":")
+    axis.locator_params(axis="x", steps=[1, 2, 5, 10])
     axis.xaxis.set_major_formatter(lambda x, _: f"{100 * x:.0f}%")
     axis.set_xlabel("success, 95% interval; dotted: 95%")
     style.legend(figure, *axis.get_legend_handles_labels())
