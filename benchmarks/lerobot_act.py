@@ -34,7 +34,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("export", type=pathlib.Path)
     parser.add_argument("checkpoint", type=pathlib.Path)
-    parser.add_argument("--steps", type=int, default=6000)
+    parser.add_argument("--steps", type=int, default=30_000)
     args = parser.parse_args()
     torch.manual_seed(0)
     torch.set_num_threads(1)

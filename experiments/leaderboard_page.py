@@ -10,7 +10,11 @@ HERE = Path(__file__).parent
 # Reports of fine-tunings: they name the steps of the fine-tuning, not those of the policy.
 FINETUNED = "fine_tuning"
 # Names of the row of another project's policy, which was scored over a socket.
-SERVED = {"Served policy": "ACT (LeRobot)", "ws://127.0.0.1:8765": "served, from states"}
+SERVED = {
+    "Served policy": "ACT (LeRobot)",
+    "ws://127.0.0.1:8765": "served, from states, 6,000 steps",
+    "ws://127.0.0.1:8000": "served, from states, 30,000 steps",
+}
 _ELSEWHERE = ("work", "figure", "n", "where", "differs", "ours", "source", "seen")
 
 
