@@ -7,6 +7,7 @@ import pytest
 
 from starjax.cli import benchmark_args, evaluate, run_settings, stress, sweep
 from starjax.evaluation import protocol
+from starjax.evaluation.disturbances import DISTURBANCES
 
 COMMANDS = {
     "evaluate": evaluate.EvaluateArgs(),
@@ -53,6 +54,15 @@ def test_a_sweep_of_the_benchmark_is_the_same_trials_as_by_its_flags(tmp_path):
     args = dataclasses.replace(COMMANDS["sweep"], benchmark=True)
     by_name = benchmark_args.with_trials(args, "sweep", "peg_transfer")
     assert sweep._trials(tmp_path, by_name) == sweep._trials(tmp_path, by_flags)
+
+
+def test_a_stress_of_the_benchmark_has_the_levels_of_the_protocol():
+    plain = COMMANDS["stress"]
+    of_benchmark = dataclasses.replace(plain, benchmark=True)
+    for name, level in protocol.STRESS.items():
+        kind = DISTURBANCES.get(name)
+        assert tuple(stress._levels(of_benchmark, kind)) == (0.0, level)
+        assert stress._levels(plain, kind) == kind.levels
 
 
 def test_a_run_of_the_benchmark_trains_as_its_preset_and_is_scored_by_the_protocol():

@@ -84,7 +84,7 @@ def main(argv: Sequence[str]) -> int:
             print(f"{name}: {kind.description}", flush=True)
             rows = {"what": kind.description, "unit": kind.unit, "levels": {}}
             content["disturbances"][name] = rows
-            for level in args.levels or chosen.get(name) or kind.levels:
+            for level in args.levels or chosen.get(name) or _levels(args, kind):
                 levels = {**dict.fromkeys(kinds, 0.0), name: level}
                 score = _score(_folder(folder, levels), who, levels, args)
                 rows["levels"][f"{level:g}"] = score
@@ -165,6 +165,11 @@ def _kinds(
         base.check_levels("disturbance", name, chosen[name])
     kinds = {name: kind for name, kind in kinds.items() if base.suits(kind, tools)}
     return {n: kind for n, kind in kinds.items() if observation == "image" or not kind.image_only}
+
+
+def _levels(args: StressArgs, kind: Any) -> Sequence[float]:
+    """Returns the default levels of a disturbance, with --benchmark 0 and the highest."""
+    return (0.0, kind.levels[-1]) if args.benchmark else kind.levels
 
 
 def _check_together(levels: dict[str, float], tested: list[str]) -> None:
