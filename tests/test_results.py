@@ -46,7 +46,7 @@ def test_a_number_that_is_not_in_a_result_is_seen(tables):
 
 
 def test_counts_in_a_result_are_those_of_its_trials(tables):
-    for file in tables.HERE.rglob("*.json"):
+    for file in set(tables.HERE.rglob("*.json")) - set(tables.HERE.rglob("stress.json")):
         found = trial_file.read(file)
         parts = {"all": found["trials"]}
         if file.name != "sweep.json":
@@ -59,13 +59,22 @@ def test_counts_in_a_result_are_those_of_its_trials(tables):
                 assert (said["successes"], said["trials"]) == counts, (file, test, part)
 
 
+def test_counts_under_a_disturbance_are_those_of_its_failures(tables):
+    for file in tables.HERE.rglob("stress.json"):
+        for name, kind in json.loads(file.read_text())["disturbances"].items():
+            for level, score in kind["levels"].items():
+                failures = score["strict"]["trials"] - score["strict"]["successes"]
+                assert failures == len(score["failed"]), (file, name, level)
+
+
 def test_every_result_belongs_to_a_study(tables):
     used = set()
     for folder in tables.claims.folders():
         spec = tables.claims.load(folder).spec
         files = [folder / file for file in spec.get("runs", {}).values()]
         used |= {file.resolve() for file in files}
-        used |= {file.with_name("sweep.json").resolve() for file in files}
+        beside = ("sweep.json", "stress.json")
+        used |= {file.with_name(name).resolve() for file in files for name in beside}
     kept = {file.resolve() for file in tables.HERE.rglob("*.json")}
     assert kept <= used
     for file in tables.HERE.rglob("*.trials.npz"):
