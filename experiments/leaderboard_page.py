@@ -9,11 +9,10 @@ from starjax.report import formats, leaderboard, leaderboard_tables
 HERE = Path(__file__).parent
 # Reports of fine-tunings: they name the steps of the fine-tuning, not those of the policy.
 FINETUNED = "fine_tuning"
-# Names of the row of another project's policy, which was scored over a socket.
+# Policies of another project, scored over a socket: digest -> method and policy.
 SERVED = {
-    "Served policy": "ACT (LeRobot)",
-    "ws://127.0.0.1:8765": "served, from states, 6,000 steps",
-    "ws://127.0.0.1:8000": "served, from states, 30,000 steps",
+    "d0a136d3": ["ACT (LeRobot)", "served, from states, 6,000 steps"],
+    "9be6f1d2": ["ACT (LeRobot)", "served, from states, 30,000 steps"],
 }
 _ELSEWHERE = ("work", "figure", "n", "where", "differs", "ours", "source", "seen")
 
@@ -23,7 +22,9 @@ def ours() -> str:
     files = [file for file in sorted(HERE.rglob("*.json")) if FINETUNED not in file.parts]
     named = [file for file in files if _version(file)]
     rows = leaderboard_tables.current(leaderboard.read(named)[0])
-    table = [[SERVED.get(cell, cell) for cell in line] for line in leaderboard_tables.table(rows)]
+    table = leaderboard_tables.table(rows)
+    for row, line in zip(rows, table[1:], strict=True):
+        line[1:3] = SERVED.get(row.weights, line[1:3])
     numbered = enumerate(leaderboard_tables.commands(rows), 1)
     commands = "\n".join(f"{number}. `{command}`" for number, command in numbered)
     return f"{formats.render(table, names=3)}\n\n{commands}"

@@ -168,7 +168,7 @@ def _kinds(
 
 
 def _levels(args: StressArgs, kind: Any) -> Sequence[float]:
-    """Returns the default levels of a disturbance, with --benchmark 0 and the highest."""
+    """Returns the default levels of a disturbance; with --benchmark, zero and the highest."""
     return (0.0, kind.levels[-1]) if args.benchmark else kind.levels
 
 
