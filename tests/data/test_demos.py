@@ -19,7 +19,7 @@ import pytest
 import stubs
 
 from starjax import rcm
-from starjax.core import errors
+from starjax.core import errors, sources
 from starjax.core.types import Agent
 from starjax.data import demos, load, schema, store
 from starjax.runtime import files, xla
@@ -72,6 +72,12 @@ def test_the_first_successes_of_every_trocar_are_kept(sealed):
         assert [r["trial"] for r in here] == list(range(len(here)))
         assert sum(r["success"] for r in here) == 4 and here[-1]["success"]
         assert all(bool(r["files"]) == r["success"] for r in here)
+
+
+def test_programs_are_prepared_without_parsing_source(monkeypatch):
+    # It runs in a thread: Python 3.11.7 fails if two threads parse (python/cpython#106905).
+    monkeypatch.setattr(sources, "record", lambda _: pytest.fail("source parsed"))
+    demos.precompile(stubs.make_env("state", unlucky=0.4), EXPERT, TROCARS, SETTINGS)
 
 
 def test_an_episode_is_what_the_expert_did(sealed):

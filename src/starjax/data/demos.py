@@ -78,7 +78,7 @@ def collect(
     with sharing.shared(root) as share:
         share.first("sound", lambda: _prepare(root, description, settings, total, report))
         records = _records(root, store.keys(root))
-        frame_bytes = schema.frame_bytes(description)
+        frame_bytes = schema.frame_bytes(description["features"])
         lanes = share.first("lanes", lambda: _lanes(layout, total, frame_bytes, share.count))
         max_workers = max(1, min(workers.worker_count(), _fitting(frame_bytes) // lanes))
         simulate = _simulator(env, agent, params, trocars, settings, layout._replace(lanes=lanes))
@@ -136,7 +136,7 @@ def precompile(
     """Compiles, in the background, the programs that `collect` runs on one device."""
     trocars = configurations.listed(trocars, len(env.p_world_ref))
     total = settings.per_trocar * len(trocars.radius)
-    frame_bytes = schema.frame_bytes(schema.describe(env, trocars, settings))
+    frame_bytes = schema.frame_bytes(schema.features(env))
     rules = _rules(settings, _lanes(DEFAULT_LAYOUT, total, frame_bytes, 1))
     engine.precompile(env, agent, params, trocars, rules, episodes.DEMONSTRATION)
 
@@ -161,7 +161,7 @@ def _prepare(
     store.create(root, description)
     store.clean(root)
     done = _check_episodes(root, settings.seed, report)
-    guess = min(settings.max_steps, FRAME_GUESS) * schema.frame_bytes(description)
+    guess = min(settings.max_steps, FRAME_GUESS) * schema.frame_bytes(description["features"])
     files.require_writable(root, max(total - done, 0) * guess)
 
 

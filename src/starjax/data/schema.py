@@ -62,7 +62,6 @@ def describe(env: Env, trocars: Trocar, settings: DemoSettings) -> dict[str, Any
       env: `sim.env.Env`.
       trocars: fields `[C, A]`.
     """
-    frame = programs.frame(env, episodes.DEMONSTRATION)
     expert = expert_name(env.task, settings)
     parts = [
         *registries.parts(env.names),
@@ -71,14 +70,6 @@ def describe(env: Env, trocars: Trocar, settings: DemoSettings) -> dict[str, Any
         ),
         *settings.disturbances,
     ]
-    features = {
-        name: {
-            "shape": list(leaf.shape),
-            "dtype": np.dtype(leaf.dtype).str,
-            "what": episodes.what(name),
-        }
-        for name, leaf in frame.items()
-    }
     return {
         "schema": store.SCHEMA,
         **{name: x for name, x in settings._asdict().items() if name not in _NESTED},
@@ -95,7 +86,7 @@ def describe(env: Env, trocars: Trocar, settings: DemoSettings) -> dict[str, Any
             "labels": list(env.task.labels),
             "stages": list(env.task.stages),
         },
-        "features": features,
+        "features": features(env),
         "model": model_hash(env.scene),
         "seed_rule": SEED_RULE,
         **sources.record(parts),
@@ -109,10 +100,21 @@ def stream(description: Mapping[str, Any]) -> int:
     return description.get("stream", STREAM)
 
 
-def frame_bytes(description: Mapping[str, Any]) -> int:
-    """Returns the bytes of one recorded control step."""
-    features = description["features"].values()
-    return sum(math.prod(x["shape"]) * np.dtype(x["dtype"]).itemsize for x in features)
+def features(env: Env) -> dict[str, dict[str, Any]]:
+    """Describes the arrays of a recorded control step, by name."""
+    return {
+        name: {
+            "shape": list(leaf.shape),
+            "dtype": np.dtype(leaf.dtype).str,
+            "what": episodes.what(name),
+        }
+        for name, leaf in programs.frame(env, episodes.DEMONSTRATION).items()
+    }
+
+
+def frame_bytes(features: Mapping[str, Mapping[str, Any]]) -> int:
+    """Returns the bytes of one recorded control step with the given features."""
+    return sum(math.prod(x["shape"]) * np.dtype(x["dtype"]).itemsize for x in features.values())
 
 
 def expert_name(task: Task, settings: DemoSettings) -> str:

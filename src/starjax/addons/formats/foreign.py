@@ -124,7 +124,7 @@ def import_mapped(
         files.write_json(root / schema.IMPORTED, about)
 
     frames = sum(k.length for k in kept)
-    size = schema.frame_bytes(description) * frames
+    size = schema.frame_bytes(description["features"]) * frames
     digest = store.write(root, description, episodes_to_write(), size, note)
     count = len(kept) - len(unread)
     left_out = len(source.lengths) - count
