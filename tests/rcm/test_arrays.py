@@ -1,5 +1,6 @@
 """Maps of arrays are programs, few of which are kept."""
 
+import importlib.util
 import inspect
 
 import jax
@@ -37,6 +38,19 @@ def test_maps_of_arrays_are_programs_kept_by_shape():
     with pytest.raises(ValueError) as caught:
         space.decode(action[:, :2], trocar, where)
     assert "\n" not in str(caught.value)
+
+
+def test_a_program_may_import_the_maps():
+    spec = importlib.util.spec_from_file_location("arrays_again", arrays.__file__)
+    again = importlib.util.module_from_spec(spec)
+
+    def first_use(x):
+        spec.loader.exec_module(again)
+        return again.bounded(x)
+
+    jax.jit(first_use)(drawn(3))
+    assert again._are_concrete({"x": drawn(3)})
+    jax.jit(lambda x: np.testing.assert_(not again._are_concrete({"x": drawn(3)})) or x)(1.0)
 
 
 def test_few_programs_are_kept(monkeypatch):

@@ -3,6 +3,7 @@
 import functools
 import inspect
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, ParamSpec, TypeVar
 
 import jax
@@ -14,11 +15,14 @@ from jax.typing import ArrayLike
 
 MAX_PROGRAMS = 64  # programs of a map, one per combination of shapes and types
 _VALUES = (jax.Array, np.ndarray, np.number, np.bool_, int, float)
-_OUTSIDE = get_opaque_trace_state()  # outside of every program
 _BOUND = 1e30  # bound of finite inputs: their sums and squares do not overflow
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
+
+# jax's state outside of every program: that of a new thread, as a program may import this module.
+with ThreadPoolExecutor(1) as _thread:
+    _OUTSIDE = _thread.submit(get_opaque_trace_state).result()
 
 
 def broadcasting(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
