@@ -45,9 +45,9 @@ _BUILT_IN: dict[str, RunConfig] = {
     # matrix products, so the U-Net is small.
     "cpu": RunConfig(
         preset="cpu",
-        # Without images, demonstrations cost little: twice the paper's number, and windows from one
-        # frame in eight, since neighbouring windows teach nearly the same.
-        demos=DemosConfig(per_trocar=60, expert="one_wall"),
+        # Without images, demonstrations cost little: four times the paper's number, and windows from
+        # one frame in eight, since neighbouring windows teach nearly the same.
+        demos=DemosConfig(per_trocar=120, expert="one_wall"),
         policy=PolicyConfig(
             learner="flow",
             image_size=128,
