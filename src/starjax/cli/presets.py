@@ -45,8 +45,8 @@ _BUILT_IN: dict[str, RunConfig] = {
     # matrix products, so the U-Net is small.
     "cpu": RunConfig(
         preset="cpu",
-        # Without images, demonstrations cost little: four times the paper's number, and windows from
-        # one frame in eight, since neighbouring windows teach nearly the same.
+        # Without images, demonstrations cost little: four times the paper's number, with windows
+        # from one frame in eight, since neighbouring windows teach nearly the same.
         demos=DemosConfig(per_trocar=120, expert="one_wall"),
         policy=PolicyConfig(
             learner="flow",
@@ -165,7 +165,7 @@ class Timing(NamedTuple):
 
 
 TIMINGS = {
-    "cpu": Timing("2 cores of an AMD EPYC", "cpu", 242.6, "main_job/cpu/run.json"),
+    "cpu": Timing("2 cores of an AMD EPYC", "cpu", 456.0, "main_job/cpu/run.json"),
     "gpu": Timing("an NVIDIA H200 with 16 cores", "gpu", 195.3, "main_job/gpu/encoder_0.json"),
 }
 
